@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from command_line import graphvio
 
 from graphvio.cli.requirements import REQUIRED
@@ -112,3 +113,59 @@ def test_an_impossible_number_is_refused(command: str, option: str, value: str, 
     assert value in ran.stderr
     assert option.strip("-").split("-")[0] in ran.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+CAMERA = {
+    "camera_model": "pinhole",
+    "intrinsics": [400.0, 400.0, 320.0, 240.0],
+    "distortion_model": "none",
+    "distortion_coeffs": [],
+    "resolution": [640, 480],
+    "T_cam_imu": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+}
+
+
+WRONG = """\
+run nothing.txt
+run .
+run empty
+run room
+run walk --topics imu=/imu
+run walk --rig camchain.yaml
+run walk --rig rig.yaml
+run walk --config config.yaml
+run walk --config quick
+run walk --cameras 9
+run walk --from 1000
+live webcam
+live v4l2:?colour=1
+live replay:walk?speed=fast
+rig nothing.txt
+compare walk walk
+evaluate walk walk
+simulate hall --out a
+simulate room --out a --rig car
+simulate room --out a --calibration-error 9
+simulate room --out a --rig-change fall
+simulate room --out a --calibration-error 1 --calibration-component lens
+calibrate walk --what lens
+convert walk --out a --format avi
+benchmark moon .
+optimize walk --out a --scale 2
+"""
+
+
+def test_refusals_are_short(room_walk: Path, tmp_path: Path) -> None:
+    """What is wrong, where, and what to do, in a line that is read at a glance."""
+    rig = "graphvio_rig: 1\nimu: {time_offset_s: 0.0}\npairs: []"
+    camchain = yaml.safe_dump({f"cam{k}": CAMERA for k in (0, 1)})
+    files = {"camchain.yaml": camchain, "rig.yaml": rig, "nothing.txt": "", "config.yaml": "motion: {colour: 1}"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "walk").symlink_to(room_walk)
+    for typed in WRONG.splitlines():
+        ran = graphvio(*typed.split(), folder=tmp_path)
+        assert ran.returncode == 2, typed
+        assert ran.stderr.count("\n") == 1, typed
+        assert len(ran.stderr) <= 300, f"{typed}: {ran.stderr}"

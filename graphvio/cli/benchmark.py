@@ -65,6 +65,7 @@ def benchmark(
     from graphvio.errors import BenchmarkError
     from graphvio.results import ResultWriter
     from graphvio.simulation import default_rig
+    from graphvio.wording import listed
 
     chosen = dataset_of(dataset)
     settings = Config.load(config)
@@ -74,7 +75,7 @@ def benchmark(
         names = [each.name for each in found]
         for name in wanted:
             if name not in names:
-                raise BenchmarkError(f"--sequences {name}: {folder} holds {', '.join(names)}")
+                raise BenchmarkError(f"--sequences {name}: {folder} holds {listed(names)}")
         found = [each for each in found if each.name in wanted]
     results = out if out is not None else ResultWriter.new_folder(Path("results"), f"benchmark-{chosen.key}")
     at_once = min(jobs if jobs is not None else max(1, (os.cpu_count() or 1) // 2), len(found))

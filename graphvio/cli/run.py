@@ -155,8 +155,8 @@ def _print_summary(summary: Summary, folder: Path) -> None:
     if doubtful > _MAX_DOUBTFUL_SHARE * summary.framesets:
         warn(
             f"vision failed, was weak, or contradicted the IMU {doubtful} times in {summary.framesets} framesets: see "
-            f"{folder / 'events.jsonl'}. Where images are good, check the calibration ('graphvio rig' shows it), the "
-            "IMU's units (rad/s, m/s^2) and axes, and compare with --no-imu"
+            f"{folder / 'events.jsonl'}; check the calibration (graphvio rig), the IMU's units and axes, and compare "
+            "with --no-imu"
         )
     if summary.resets:
         typer.echo(f"reinitialised {summary.resets} times: see {folder / 'events.jsonl'}")

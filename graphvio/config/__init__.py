@@ -122,7 +122,10 @@ class Config:
         try:
             data = yaml.safe_load(text)
         except yaml.YAMLError as error:
-            raise ConfigError(f"{where}: is not valid YAML: {' '.join(str(error).split())}") from None
+            mark = getattr(error, "problem_mark", None)
+            line = "" if mark is None else f"line {mark.line + 1} "
+            problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
+            raise ConfigError(f"{where}: {line}is not valid YAML ({problem}); correct it there") from None
         config: Config = build(Config, {} if data is None else data, where)
         return config
 

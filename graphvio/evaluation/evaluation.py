@@ -237,6 +237,5 @@ def _why_not_associated(estimate: Trajectory, truth: Trajectory, associated: int
         return f"the estimate has {len(estimate)} poses; at least {_MIN_POSES} are needed for an alignment"
     return (
         f"only {associated} of {len(estimate)} estimates ({interval(estimate)}) have a true pose ({interval(truth)}, "
-        f"at most {max_gap_s:g} s apart); at least {_MIN_POSES} are needed: check that both files are of one "
-        "recording and use one clock"
+        f"at most {max_gap_s:g} s apart); at least {_MIN_POSES} are needed: are both of one recording, by one clock?"
     )

@@ -20,6 +20,7 @@ from graphvio.rig import (
     checked_views,
     overlap,
 )
+from graphvio.wording import listed
 
 _MIN_OVERLAP = 0.25
 
@@ -54,11 +55,10 @@ def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Pat
     ):
         couples = _overlapping(cameras)
         if not couples and imu is None:
-            names = ", ".join(camera.name for camera in cameras)
+            names = listed(camera.name for camera in cameras)
             raise RigError(
-                f"{path}: no two of the cameras {names} see the same part of the scene, and there is no IMU; graphvio "
-                "needs a stereo pair or an IMU: check the direction of body_T_cam, or write a rig.yaml that says "
-                "which cameras form pairs"
+                f"{path}: no two of the cameras {names} share a view, and there is no IMU; check the direction of "
+                "body_T_cam, or write a rig.yaml that says which cameras form pairs"
             )
     pairs = [StereoPair(f"pair{k}", cameras[i], cameras[j]) for k, (i, j) in enumerate(couples)]
     paired = {i for couple in couples for i in couple}

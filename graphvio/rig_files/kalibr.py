@@ -20,6 +20,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
+from graphvio.wording import listed
 
 PINHOLE = "pinhole"
 SPHERES = {"ds": "double-sphere", "eucm": "extended-unified", "omni": "omnidirectional"}
@@ -146,10 +147,10 @@ def find_imu_file(camchain: Path) -> Path:
     if len(others) == 1:
         return others[0]
     defaults = ", ".join(f"{IMU_KEYS[name]}: {getattr(Imu(), name)}" for name in NOISE_KEYS)
-    found = f"more than one IMU file ({', '.join(p.name for p in others)})" if others else "no imu.yaml"
+    found = f"more than one IMU file ({listed(p.name for p in others)})" if others else "no imu.yaml"
     raise RigError(
-        f"{camchain}: {found} next to it, though it has T_cam_imu; put the IMU's noise into imu.yaml there "
-        f"(graphvio's defaults:  {defaults}, update_rate: {Imu().rate_hz})"
+        f"{camchain}: has T_cam_imu, and {found} next to it; write one with the IMU's noise, such as  "
+        f"{defaults}, update_rate: {Imu().rate_hz}"
     )
 
 

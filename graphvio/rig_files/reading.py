@@ -115,7 +115,7 @@ class Section:
             raise RigError(
                 f"{self.where(names[missing[0]])} is missing"
                 + (f" (and {len(missing) - 1} more)" if len(missing) > 1 else "")
-                + f"; take it from the IMU's data sheet or calibration, or write graphvio's default:  {lines}"
+                + f"; write what the IMU's data sheet says, or graphvio's default:  {lines}"
             )
         return {name: self.number(key) for name, key in names.items()}
 

@@ -16,6 +16,7 @@ from graphvio.sessions import cdr
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
 from graphvio.sessions.rig_of_topics import info_topics, rig_of_topics, stereo_topics, transforms_in
 from graphvio.sessions.topics import Place, Topic
+from graphvio.wording import listed
 
 _POLL_S = 0.05
 
@@ -68,10 +69,10 @@ def listen_for_rig(
     except SessionError as error:
         raise RigError(f"{received.path}: {error}") from None
     if rig is None:
-        described = ", ".join(sorted(name for name, kind in types.items() if kind == CAMERA_INFO)) or "none"
+        described = listed(sorted(name for name, kind in types.items() if kind == CAMERA_INFO))
         raise RigError(
-            f"{received.path}: no stereo pair has images and camera_info of its left and right camera; topics with "
-            f"images are {', '.join(sorted(images)) or 'none'}, with camera_info {described}. Give a rig of your own"
+            f"{received.path}: no stereo pair has images and camera_info of both cameras; give a rig by --rig. Images: "
+            f"{listed(sorted(images))}; camera_info: {described}"
         )
     return _rename_cameras(rig, cameras)
 

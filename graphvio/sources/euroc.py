@@ -16,7 +16,7 @@ from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import read_frame_csv, read_imu_csv
 
-LAYOUT = "EuRoC/ASL and TUM-VI: mav0/cam0/data.csv, mav0/cam0/data/*.png, mav0/imu0/data.csv"
+LAYOUT = "EuRoC/ASL and TUM-VI: mav0/cam0/data.csv"
 _TRUTHS = ("state_groundtruth_estimate0", "gt", "mocap0")  # of EuRoC, Monado and TUM-VI
 
 

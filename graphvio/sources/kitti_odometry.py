@@ -10,7 +10,7 @@ from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import decimal_ns, read_times
 
-LAYOUT = "KITTI odometry: image_0/*.png, image_1/*.png (or image_2, image_3), times.txt, calib.txt"
+LAYOUT = "KITTI odometry: image_0/*.png, times.txt"
 
 
 def matches(path: Path) -> bool:

@@ -15,7 +15,7 @@ from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import decimal_ns, read_times
 
-LAYOUT = "KITTI raw: image_00/data/*.png, image_00/timestamps.txt (and 01, or 02 and 03)"
+LAYOUT = "KITTI raw: image_00/data/*.png"
 
 
 def matches(path: Path) -> bool:

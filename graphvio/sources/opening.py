@@ -103,8 +103,10 @@ def layout_of(path: Path) -> Layout:
     """
     if not path.is_dir():
         instead = meant_instead(path, is_recording)
+        names = ", ".join(layout.LAYOUT.partition(":")[0] for layout in _layouts())
         raise SourceError(
-            f"{path}: is no recording that graphvio knows; {instead}{session.LAYOUT}, or a folder ({_known()})"
+            f"{path}: is no recording that graphvio knows; {instead}give a session or bag (.mcap, .bag), or a folder "
+            f"({names})"
         )
     if next(path.iterdir(), None) is None:
         raise SourceError(f"{path}: is empty; looked for {_known()}")
@@ -133,7 +135,7 @@ def _known() -> str:
 def _required(rig: Rig | None, path: Path) -> Rig:
     if rig is None:
         raise RigError(
-            f"{path}: carries no calibration; write a rig.yaml into it, which  graphvio rig FILE.. --out "
-            f"{path}/rig.yaml  makes of Kalibr's and other files, or give a calibration of your own by --rig"
+            f"{path}: carries no calibration; write a rig.yaml into it (graphvio rig FILE.. --out rig.yaml makes it of "
+            "Kalibr's and other files), or give a calibration by --rig"
         )
     return rig

@@ -35,10 +35,10 @@ from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
 from graphvio.sources.tables import ImuTable, clean_stamps
+from graphvio.wording import listed
 
 _IMU_NAME = "imu"
 _MASKS = "/mask"  # after a camera's name
-LAYOUT = "sessions and bags: NAME.mcap, NAME.bag, a folder with metadata.yaml"
 
 
 def rig_in(store: Store) -> Rig | None:
@@ -85,7 +85,7 @@ def read_index(store: Store, rig: Rig, faults: FaultLog, topics: Mapping[str, st
 
 def _named(store: Store, name: str) -> Topic:
     if name not in store.topics:
-        raise SourceError(f"{store.path}: has no topic {name}; it has {', '.join(sorted(store.topics))}")
+        raise SourceError(f"{store.path}: has no topic {name}; it has {listed(sorted(store.topics))}")
     return store.topics[name]
 
 

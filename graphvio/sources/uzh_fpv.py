@@ -17,7 +17,7 @@ from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import ImuTable, clean_stamps, decimal_ns, read_lines, read_times
 
-LAYOUT = "UZH-FPV: left_images.txt, right_images.txt, imu.txt, img/*.png"
+LAYOUT = "UZH-FPV: left_images.txt"
 _FILES = {"cam0": "left_images.txt", "cam1": "right_images.txt"}
 _NS_PER_S = 1_000_000_000
 

@@ -19,6 +19,7 @@ from graphvio.live.device_clock import host_ns_of_monotonic, realtime_to_host_ns
 from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.measurements.readings import ImuReading, host_ns
+from graphvio.wording import listed
 
 _SYSFS = Path("/sys/bus/iio/devices")
 _DEV = Path("/dev")
@@ -247,7 +248,7 @@ def _find(sysfs: Path, name: str) -> Path:
         with suppress(OSError):
             known.setdefault((folder / "name").read_text().strip(), folder)
     if name not in known:
-        raise SourceError(f"there is no IIO device {name!r} in {sysfs}; there are {', '.join(known) or 'none'}")
+        raise SourceError(f"there is no IIO device {name!r} in {sysfs}; there are {listed(known)}")
     return known[name]
 
 

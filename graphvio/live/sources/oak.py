@@ -284,9 +284,8 @@ def factory_rig(
         except RigError as error:
             if not settings.is_imu_guessed:
                 raise RigError(
-                    f"{name}: the factory's calibration does not have the pose of the IMU, as with most OAK cameras "
-                    f"({error}); give a rig file (--rig), or imu=none. To make one, record a walk with places=guess, "
-                    "then: graphvio calibrate RECORDING --correct-imu --out rig.yaml"
+                    f"{name}: its calibration lacks the pose of the IMU ({error}); give --rig FILE or imu=none: "
+                    "a walk with places=guess makes it:  graphvio calibrate WALK --correct-imu --out FILE"
                 ) from None
     body_T_right = body_T_left @ se3_inverse(right_T_left)
     cameras = [

@@ -22,6 +22,7 @@ from graphvio.sessions import cdr
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU
 from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.topics import image_topic, preference, sides_of
+from graphvio.wording import listed
 
 _NODE: Final = "/graphvio_source"
 _OPTIONS: Final = ("domain", "imu", "body", "reliable", "wait_s")
@@ -190,10 +191,10 @@ class Ros2Source:
             if not wait(_POLL_S):
                 break
         if missing or not published:
+            topics = listed(sorted({each.topic for each in published}))
             raise SourceError(
-                f"{self.name}: no publisher of {min(missing, default='any topic')}; topics on domain {self._domain} "
-                f"are {', '.join(sorted({each.topic for each in published})) or 'none'}. Start the publisher, or check "
-                "ROS_DOMAIN_ID and the network"
+                f"{self.name}: no publisher of {min(missing, default='any topic')}; start it, or check ROS_DOMAIN_ID "
+                f"and the network. Topics on domain {self._domain}: {topics}"
             )
         return published
 
@@ -228,7 +229,7 @@ def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], wh
             if camera.name not in found and not named:
                 raise SourceError(
                     f"{where}: no topic has a name that fits the images of {camera.name}; give {camera.name}=/TOPIC. "
-                    f"Topics with images: {', '.join(images) or 'none'}"
+                    f"Topics with images: {listed(images)}"
                 )
             if camera.name not in found:
                 found[camera.name] = named[0]
