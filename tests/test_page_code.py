@@ -38,6 +38,8 @@ HERE = (
     "docs/how-to/slam-interface.md",
     "docs/how-to/slam.md",
     "docs/reference/data-contract.md",
+    "docs/reference/results.md",
+    "docs/reference/simulation.md",
     "docs/tutorials/two-realsense.md",
 )
 NEED = {
@@ -247,6 +249,7 @@ def test_data_contract(session: Path, tmp_path: Path) -> None:
             made.unlink(missing_ok=True)
         return [*arguments, "--duration", "1"] if arguments[0] == "simulate" else arguments
 
-    run_commands("docs/reference/data-contract.md", tmp_path, made_again)
+    for page in ("docs/reference/data-contract.md", "docs/reference/results.md", "docs/reference/simulation.md"):
+        run_commands(page, tmp_path, made_again)
     assert (tmp_path / "room/rig-true.yaml").exists()
     assert (tmp_path / "S/mav0/cam3/data.csv").exists()
