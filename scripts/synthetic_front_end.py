@@ -75,7 +75,7 @@ class SyntheticFrontEnd:
             yield Keyframe(
                 each.id, each.epoch, each.stamp_ns, each.status, each.odom_T_body, each.covariance, each.previous_id,
                 each.previous_T_body, each.relative_covariance, each.landmarks,
-                self._frameset_at(each.stamp_ns).stereo,
+                self._frameset_at(each.stamp_ns).images,
             )  # fmt: skip
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:

@@ -89,6 +89,8 @@ def make_session(
         is_keyframe=np.arange(len(rows)) % _KEYFRAME_FRAMES == 0,
         with_imu=np.ones(len(rows), dtype=bool),
         is_start=np.arange(len(rows)) == 0,
+        keyframe_before=np.full(len(rows), -1),
+        keyframe_covariance=np.zeros((len(rows), 6, 6)),
         motions=motions,
         own=own,
         own_pair=own_pair,

@@ -18,6 +18,7 @@ from graphvio.errors import SourceError
 from graphvio.geometry import se3_inverse
 from graphvio.mapping.mapper import Mapper
 from graphvio.measurements.sensors import FrameSet
+from graphvio.rig import Rig
 from graphvio.simulation import Simulator
 from graphvio.slam.keyframe import CorrectionResult
 
@@ -66,6 +67,8 @@ def front_end(
     session: int = 0,
     breaks: Collection[int] = (),
     kind: type[SyntheticFrontEnd] = SyntheticFrontEnd,
+    rig: Rig | None = None,
+    sigmas: tuple[float, float] = SIGMAS,
 ) -> tuple[SyntheticFrontEnd, Float]:
     """Keyframes of some framesets, 20 a second, and their true poses in the first one's.
 
@@ -77,6 +80,8 @@ def front_end(
         session: number of the session, which offsets its stamps.
         breaks: keyframes with which epochs begin.
         kind: of front-end.
+        rig: single cameras of the simulator's rig, or None for its pairs.
+        sigmas: of the drift, radians and metres after a metre.
     """
     indices = np.arange(first, last, step)
     truth = simulator().world_T_body[indices]
@@ -84,10 +89,15 @@ def front_end(
     index_of = dict(zip(stamps.tolist(), indices.tolist(), strict=True))
 
     def frameset_at(stamp_ns: int) -> FrameSet:
-        return FrameSet(stamp_ns, rendered(index_of[stamp_ns]).images)
+        images = rendered(index_of[stamp_ns]).images
+        if rig is not None:
+            whole = simulator().rig.groups
+            of_camera = {c.name: i for j, each in images.items() for c, i in zip(whole[j].cameras, each, strict=True)}
+            images = {j: (of_camera[single.name],) for j, single in enumerate(rig.singles)}
+        return FrameSet(stamp_ns, images)
 
     odom_T_body = se3_inverse(truth[0]) @ truth
-    made = kind(simulator().rig, stamps.tolist(), odom_T_body, frameset_at, SIGMAS, seed, breaks)
+    made = kind(rig or simulator().rig, stamps.tolist(), odom_T_body, frameset_at, sigmas, seed, breaks)
     return made, truth
 
 

@@ -28,6 +28,7 @@ from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import Recorder
+from graphvio.sources import Source
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed: the extra maps")
 
@@ -54,7 +55,18 @@ class Exported:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("colmap")
-    source = open_source(recorded(folder / "recording", SECONDS))
+    return export_of(open_source(recorded(folder / "recording", SECONDS)), folder)
+
+
+@pytest.fixture(scope="module")
+def with_a_single(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    """Of a pair, and of one camera of the other pair."""
+    folder = tmp_path_factory.mktemp("single")
+    path = recorded(folder / "recording", SECONDS)
+    return export_of(open_source(path, open_source(path).rig.with_only(["cam0", "cam1", "cam2"])), folder)
+
+
+def export_of(source: Source, folder: Path) -> Exported:
     config = replace(Config(), optimization=OptimizationConfig(features=500))
     recorder = Recorder(NAME)
     odometry = Odometry(source.rig, config)
@@ -158,12 +170,32 @@ def test_export_points_have_many_observations_within_a_pixel(exported: Exported)
 
 
 def test_export_points_lie_on_true_surfaces(exported: Exported) -> None:
+    errors = depth_errors(exported, 0, 1, 2, 3)
+    assert len(errors) > 1000
+    assert np.median(np.abs(errors)) < 0.01
+    assert np.mean(np.abs(errors) > 0.1) < 0.03
+
+
+def test_export_points_of_a_single_camera_lie_on_true_surfaces(with_a_single: Exported) -> None:
+    """Its images belong to the rig, and its points to the model of the pair."""
+    model, rig = read(with_a_single), with_a_single.session.rig
+    assert [single.name for single in rig.singles] == ["cam2"]
+    assert model.num_reg_images() == 3 * len(with_a_single.session.places)
+    errors = depth_errors(with_a_single, 2)
+    assert len(errors) > 200
+    assert np.median(np.abs(errors)) < 0.02
+    assert np.mean(np.abs(errors) > 0.1) < 0.1
+
+
+def depth_errors(exported: Exported, *numbers: int) -> Float:
+    """Relative errors (N,) of the depths of points that some cameras see, by their numbers in the rig."""
     simulator = walk_simulator(SECONDS)
     row_of = {int(stamp): row for row, stamp in enumerate(simulator.stamps_ns)}
     model = read(exported)
     errors = []
     for place in exported.session.places[::3]:
-        for number, camera in enumerate(exported.session.rig.cameras):
+        for number in numbers:
+            camera = exported.session.rig.cameras[number]
             depth = simulator.view(row_of[place.stamp_ns], number).depth
             image = model.find_image_with_name(image_name(NAME, camera.name, place.stamp_ns))
             cam_T_world = image.cam_from_world()
@@ -171,9 +203,7 @@ def test_export_points_lie_on_true_surfaces(exported: Exported) -> None:
                 if each.has_point3D():
                     u, v = np.round(each.xy - 0.5).astype(int)
                     errors.append((cam_T_world * model.point3D(each.point3D_id).xyz)[2] / depth[v, u] - 1.0)
-    assert len(errors) > 1000
-    assert np.median(np.abs(errors)) < 0.01
-    assert np.mean(np.abs(errors) > 0.1) < 0.03
+    return np.array(errors)
 
 
 def test_export_images_are_lossless(exported: Exported) -> None:

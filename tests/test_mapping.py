@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_walks import CONFIG, Refusing, front_end, mapped
+from mapping_walks import CONFIG, Refusing, front_end, mapped, simulator
 from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float
@@ -271,3 +271,25 @@ def test_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:
     with Mapper(front_end(0, 4, seed=0)[0], CONFIG, tmp_path / "empty") as again:
         again.run()
         assert again.trajectory.stamps_ns[-1] >= again._places[-1].stamp_ns
+
+
+@pytest.mark.parametrize("cameras", [["cam0"], ["cam0", "cam2"]])
+def test_round_of_single_cameras_is_closed(cameras: list[str]) -> None:
+    """Of one camera, and of two that look opposite ways: depths come from the motion between places."""
+    rig = simulator().rig.without_pairs().with_only(cameras)
+    walk, truth = front_end(0, 240, seed=1, rig=rig, sigmas=(np.deg2rad(0.1), 0.01))
+    truth = se3_inverse(truth[0]) @ truth
+    mapper = mapped(walk)
+    drift, error = far(walk.odom_T_body, truth), far(mapper.trajectory.nav_T_body, truth)
+    assert count(mapper, "closures_used") >= 5
+    assert error[-1] < 0.25 * drift[-1]
+    assert np.sqrt((error**2).mean()) < 0.7 * np.sqrt((drift**2).mean())
+    row_of = {stamp: k for k, stamp in enumerate(mapper.trajectory.stamps_ns.tolist())}
+    squares = []
+    for closure, is_used in mapper.closures:
+        one, other = (truth[row_of[end.stamp_ns]] for end in (closure.reference, closure.current))
+        error = se3_log(se3_inverse(se3_inverse(one) @ other) @ closure.reference_T_current)
+        squares.append(error @ np.linalg.solve(closure.covariance, error))
+        assert not is_used or np.linalg.norm(error[3:]) < 0.1
+    assert np.mean(squares) < 9.0
+    assert len(walk.corrections) >= 3

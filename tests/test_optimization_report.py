@@ -76,6 +76,8 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
         is_keyframe=~no,
         with_imu=no,
         is_start=no,
+        keyframe_before=np.full(POSES, -1),
+        keyframe_covariance=np.zeros((POSES, 6, 6)),
         motions=motions,
         own=Motions(*none),
         own_pair=np.zeros(0, dtype=np.int64),

@@ -23,6 +23,8 @@ def slam(
     source: options.LiveSource,
     rig: options.RigFile = None,
     config: options.ConfigName = "default",
+    cameras: options.Cameras = None,
+    no_pairs: options.NoPairs = False,
     saved_map: Annotated[
         Path | None, typer.Option("--map", help="Saved map to localise in and to extend.", metavar="DIR")
     ] = None,
@@ -68,8 +70,8 @@ def slam(
         port=0, ros2_domain=ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
     )
     run_live(
-        source, rig, config, record=record, png=png, view=False, health_port=health_port, duration_s=duration,
-        forget_calibration=forget_calibration, services=services,
+        source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=False,
+        health_port=health_port, duration_s=duration, forget_calibration=forget_calibration, services=services,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.features import PlaceObserver
-from graphvio.optimization.loops.verification import FreshView, crossings, verified
+from graphvio.optimization.loops.motion_depth import NEIGHBOURS, PlaceMotion
+from graphvio.optimization.loops.verification import FreshView, View, crossings, verified
 from graphvio.slam.interface import SlamFrontEnd
 from graphvio.trajectory import Trajectory
 
@@ -55,7 +57,6 @@ class Mapper:
     ) -> None:
         self._front_end = front_end
         self._rig = front_end.rig
-        self._rig.need_pairs("recognition of places")
         self._config = config
         self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-")) if folder is None else folder
         try:
@@ -229,8 +230,20 @@ class Mapper:
         tried = crossings(*images[0], *images[1])
         seed = [self._config.motion.seed, earlier, later]
         stored = self._store.view(self._name(one.session), one.stamp_ns)
-        found = verified(stored, view, tried, self._observer.pairs, self._config, seed)
+        neighbours = partial(self._neighbours, earlier)
+        found = verified(stored, view, tried, self._observer.pairs, self._config, seed, neighbours)
         return None if found is None else closure_of(one, self._places[later], found)
+
+    def _neighbours(self, number: int) -> list[tuple[View, PlaceMotion]]:
+        """Return the places next to a place in its chain, and the motions to them."""
+        found: list[tuple[View, PlaceMotion]] = []
+        chains = self._graph.chains
+        for other in (number + step for step in NEIGHBOURS):
+            if 0 <= other < len(chains) and chains.fragment(other) == chains.fragment(number):
+                place = self._places[other]
+                view = self._store.view(self._name(place.session), place.stamp_ns)
+                found.append((view, PlaceMotion(*chains.motion(number, other))))
+        return found
 
     def _close_loops(self, found: list[LoopClosure], number: int) -> None:
         with self._times.stage("graph"), self._lock:

@@ -60,13 +60,13 @@ class PlaceStore:
         return StoredView(self._rig, session, stamp_ns, self._database, self._lock, frameset_at)
 
     def descriptors(self, session: str, stamp_ns: int, j: int) -> AnyArray:
-        """Return the descriptors (K, 128), uint8, of pair j's left image at a place."""
+        """Return the descriptors (K, 128), uint8, of the left image, or the single one, of group j at a place."""
         with self._lock:
             return self._database.descriptors(self.name(session, stamp_ns, j))
 
     def name(self, session: str, stamp_ns: int, j: int) -> str:
-        """Return the name of pair j's left image at a place."""
-        return image_name(session, self._rig.pairs[j].left.name, stamp_ns)
+        """Return the name of the left image, or the single one, of group j at a place."""
+        return image_name(session, self._rig.groups[j].left.name, stamp_ns)
 
     def copy_to(self, folder: Path) -> None:
         """Copy the database, complete as it is now, to another folder."""

@@ -125,9 +125,8 @@ def _write_images(
         missing = {name for name in _names(session, place, database) if not (folder / name).exists()}
         if not missing:
             return
-        for j, images in session.source.frameset_at(place.stamp_ns).stereo.items():
-            pair = session.rig.pairs[j]
-            for camera, image in zip((pair.left, pair.right), images, strict=True):
+        for j, images in session.source.frameset_at(place.stamp_ns).images.items():
+            for camera, image in zip(session.rig.groups[j].cameras, images, strict=True):
                 name = image_name(session.name, camera.name, place.stamp_ns)
                 if name in missing:
                     write_image(folder / name, image)

@@ -30,7 +30,7 @@ _MIN_MATCHES = 15  # of two images; COLMAP ignores fewer
 
 @dataclass(frozen=True, eq=False)
 class _ImagePair:
-    """The left images of two places."""
+    """The left images, or those of single cameras, of two places."""
 
     names: tuple[str, str]
     cameras: tuple[Camera, Camera]
@@ -47,10 +47,10 @@ def verify_matches(
     pairs = {each.names: each for each in _neighbours(optimization, sessions, database)}
     pairs |= {each.names: each for each in _loops(optimization, sessions, database)}
     lefts = {
-        image_name(session.name, pair.left.name, place.stamp_ns)
+        image_name(session.name, group.left.name, place.stamp_ns)
         for session in sessions
         for place in session.places
-        for pair in session.rig.pairs
+        for group in session.rig.groups
     }
     with database.transaction():
         for first, second in database.verified_pairs():
@@ -105,7 +105,7 @@ def _neighbours(
             for other in session.places[k + 1 : k + 1 + _NEIGHBOURS]:
                 if frame[place.row] != frame[other.row]:
                     continue
-                for j in range(len(session.rig.pairs)):
+                for j in range(len(session.rig.groups)):
                     pair = _image_pair(optimization, sessions, (place, other), (j, j))
                     if database.names.issuperset(pair.names):
                         yield pair
@@ -119,18 +119,18 @@ def _loops(
         if loop.refusal:
             continue
         places = (loop.closure.reference, loop.closure.current)
-        for a in range(len(sessions[places[0].session].rig.pairs)):
-            for b in range(len(sessions[places[1].session].rig.pairs)):
+        for a in range(len(sessions[places[0].session].rig.groups)):
+            for b in range(len(sessions[places[1].session].rig.groups)):
                 pair = _image_pair(optimization, sessions, places, (a, b))
                 if database.names.issuperset(pair.names) and database.has_matches(*pair.names):
                     yield pair
 
 
 def _image_pair(
-    optimization: Optimization, sessions: Sequence[SessionInput], places: tuple[Place, Place], pairs: tuple[int, int]
+    optimization: Optimization, sessions: Sequence[SessionInput], places: tuple[Place, Place], groups: tuple[int, int]
 ) -> _ImagePair:
     of = [sessions[place.session] for place in places]
-    first, second = (session.rig.pairs[j].left for session, j in zip(of, pairs, strict=True))
+    first, second = (session.rig.groups[j].left for session, j in zip(of, groups, strict=True))
     names = [image_name(s.name, c.name, p.stamp_ns) for s, c, p in zip(of, (first, second), places, strict=True)]
     nav_T_one, nav_T_other = (optimization.sessions[p.session].nav_T_body[p.row] for p in places)
     second_T_first = second.cam_T_body @ se3_inverse(nav_T_other) @ nav_T_one @ first.body_T_cam

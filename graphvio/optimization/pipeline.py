@@ -265,7 +265,7 @@ class Stages:
         session, settings = self._sessions[number], self._config.optimization
         rows = choose_places(record, settings.place_distance_m, settings.place_angle_deg)
         places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]
-        return SessionInput(session.name, session.source, self._rigs[number], places)
+        return SessionInput(session.name, session.source, self._rigs[number], places, record)
 
     def features(self, number: int, record: SessionRecord) -> None:
         """Extract the features of a session's places."""

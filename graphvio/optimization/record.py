@@ -15,7 +15,9 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import OptimizationError
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.odometry.step import Step
+from graphvio.odometry.step import NewKeyframe, Step
+
+_NO_STAMP = -(2**62) - 1  # no measurement has it
 
 
 class Inertial(NamedTuple):
@@ -67,6 +69,9 @@ class SessionRecord:
         is_keyframe: (F,) whether later motions are measured from it.
         with_imu: (F,) whether the state has a velocity and biases.
         is_start: (F,) whether the state was initialised or reinitialised here.
+        keyframe_before: (F,) row of the keyframe before this one, or -1 where this is none, or the motion is not known.
+        keyframe_covariance: (F, 6, 6) of the motion since that one, tangent ``[rotation, translation]`` in body; zero
+            where there is none.
         motions: of the rig.
         own: motions of body over whole keyframes, measured by single pairs.
         own_pair: the pair of each of these.
@@ -86,6 +91,8 @@ class SessionRecord:
     is_keyframe: Bool
     with_imu: Bool
     is_start: Bool
+    keyframe_before: Int
+    keyframe_covariance: Float
     motions: Motions
     own: Motions
     own_pair: Int
@@ -165,6 +172,7 @@ class Recorder:
                 np.concatenate([np.zeros((0, 6)), *(each[1] for each in intervals)]),
                 self._is_covered and step.interval is not None,
                 step.initialised,
+                *_since_keyframe(step.keyframe),
             )
         )
         self._since, self._is_covered = [], True
@@ -205,6 +213,8 @@ class Recorder:
             is_keyframe=np.isin(stamps, sorted(self._references)),
             with_imu=np.array([each.gyro_bias is not None for each in estimates]),
             is_start=np.array([row.is_start for row in rows]),
+            keyframe_before=np.array([row_of.get(row.keyframe_before_ns, -1) for row in rows], dtype=np.int64),
+            keyframe_covariance=np.array([row.keyframe_covariance for row in rows]),
             motions=_joined([motion for motion in motions if _is_known(motion, row_of)], row_of),
             own=_joined([motion for _, motion in self._own if _is_known(motion, row_of)], row_of),
             own_pair=np.array([j for j, motion in self._own if _is_known(motion, row_of)], dtype=np.int64),
@@ -227,6 +237,15 @@ class _Row:
     values: Float
     covers: bool
     is_start: bool
+    keyframe_before_ns: int
+    keyframe_covariance: Float
+
+
+def _since_keyframe(keyframe: NewKeyframe | None) -> tuple[int, Float]:
+    """Return the stamp of the keyframe before one and the covariance (6, 6) of the motion since, or `_NO_STAMP`."""
+    if keyframe is None or keyframe.covariance is None or keyframe.previous_ns is None:
+        return _NO_STAMP, np.zeros((6, 6))
+    return keyframe.previous_ns, keyframe.covariance
 
 
 def _or_zero(value: Float | None) -> Float:

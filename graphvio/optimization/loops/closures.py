@@ -47,7 +47,7 @@ def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
         earlier,
         later,
         se3_inverse(found.cur_T_ref),
-        found.covariance * max(1.0, found.inliers / _INDEPENDENT_POINTS),
+        found.covariance * max(1.0, found.inliers / _INDEPENDENT_POINTS) + found.shared_covariance,
         found.inliers,
         found.pairs,
         found.is_registered,

@@ -1,4 +1,7 @@
-"""SIFT features of places, by COLMAP on the CPU, and their depth by the odometry's stereo matching."""
+"""SIFT features of places, by COLMAP on the CPU, and their depth by the odometry's stereo matching.
+
+Features of single cameras have none here: see `graphvio.optimization.loops.motion_depth`.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +16,20 @@ from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.config import Config
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
-from graphvio.optimization.loops.places import PairObserver
+from graphvio.optimization.loops.places import PairObserver, SingleObserver
 from graphvio.optimization.loops.sift import Extractor, SiftExtractor, SiftProcess
 from graphvio.optimization.threads import in_threads
-from graphvio.rig import Rig
+from graphvio.rig import Rig, StereoPair
 from graphvio.sources import Source
 
 
 @dataclass(frozen=True, eq=False)
 class PairFeatures:
-    """The features of one pair's images at a place."""
+    """The features of one pair's images, or of one single camera's image, at a place."""
 
-    left: Float  # (K, 2) pixels in the left image
+    left: Float  # (K, 2) pixels in the left image, or the only one
     descriptors: AnyArray  # (K, 128) uint8, of the features in the left image
-    right: Float  # (M, 2) pixels in the right image of those with a stereo match
+    right: Float  # (M, 2) pixels in the right image of those with a stereo match; of a single camera none
     in_right: Int  # (M,) their indices among the K
 
     @property
@@ -62,20 +65,34 @@ class PlaceObserver:
     @property
     def pairs(self) -> Sequence[PairObserver]:
         """Observers of the rig's pairs, for the calling thread."""
-        if not hasattr(self._of_thread, "pairs"):
-            self._of_thread.pairs = [PairObserver(pair, self._config) for pair in self._rig.pairs]
-        made: Sequence[PairObserver] = self._of_thread.pairs
+        return [observer for observer in self.groups if isinstance(observer, PairObserver)]
+
+    @property
+    def groups(self) -> Sequence[PairObserver | SingleObserver]:
+        """Observers of the rig's pairs and single cameras, for the calling thread."""
+        if not hasattr(self._of_thread, "groups"):
+            self._of_thread.groups = [
+                PairObserver(group, self._config)
+                if isinstance(group, StereoPair)
+                else SingleObserver(group.left, self._config)
+                for group in self._rig.groups
+            ]
+        made: Sequence[PairObserver | SingleObserver] = self._of_thread.groups
         return made
 
     def look(self, frameset: FrameSet) -> dict[int, PairFeatures]:
-        """Return pair index -> features of a frameset."""
+        """Return features of a frameset, by the index in the rig's groups."""
         seen = {}
-        for j, images in frameset.stereo.items():
-            observer = self.pairs[j]
+        for j, images in frameset.images.items():
+            observer = self.groups[j]
             pixels, descriptors = self._extract(images[0])
             usable = observer.usable(pixels)
             pixels, descriptors = pixels[usable], descriptors[usable]
-            frame = observer.observe(frameset.stamp_ns, images, pixels)
+            if len(images) == 1 or not isinstance(observer, PairObserver):
+                none = np.zeros(0, dtype=np.int64)
+                seen[j] = PairFeatures(pixels, descriptors, np.zeros((0, 2)), none)
+                continue
+            frame = observer.observe(frameset.stamp_ns, (images[0], images[1]), pixels)
             right, _ = observer.pair.right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
             seen[j] = PairFeatures(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
         return seen
@@ -120,26 +137,23 @@ def extract_places(
 
 def is_stored(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) -> bool:
     """Return whether the features of a place are in the database."""
-    return any(image_name(session, pair.left.name, stamp_ns) in database.names for pair in rig.pairs)
+    return any(image_name(session, group.left.name, stamp_ns) in database.names for group in rig.groups)
 
 
 def store_place(
     database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: Mapping[int, PairFeatures]
 ) -> None:
     """Write the features of a place to the database, all or nothing."""
-    names = {
-        camera.name: image_name(session, camera.name, stamp_ns)
-        for j in seen
-        for camera in (rig.pairs[j].left, rig.pairs[j].right)
-    }
+    names = {camera.name: image_name(session, camera.name, stamp_ns) for j in seen for camera in rig.groups[j].cameras}
     with database.transaction():
         rig_id, cameras = database.rig_of(session, rig) or database.add_rig(rig)
         database.add_place(rig_id, {cameras[camera]: name for camera, name in names.items()})
         for j, found in seen.items():
-            left, right = names[rig.pairs[j].left.name], names[rig.pairs[j].right.name]
+            left, *rights = (names[camera.name] for camera in rig.groups[j].cameras)
             database.add_features(left, found.left, found.descriptors)
-            database.add_features(right, found.right)
-            database.add_matches(left, right, found.rows)
+            for right in rights:
+                database.add_features(right, found.right)
+                database.add_matches(left, right, found.rows)
 
 
 def merge_places(
@@ -151,10 +165,12 @@ def merge_places(
     """
     for stamp_ns in stamps_ns:
         seen = {}
-        for j, pair in enumerate(rig.pairs):
-            left, right = (image_name(session, camera.name, stamp_ns) for camera in (pair.left, pair.right))
+        for j, group in enumerate(rig.groups):
+            left, *rights = (image_name(session, camera.name, stamp_ns) for camera in group.cameras)
             if left in part.names and left not in whole.names:
-                in_right = part.matches(left, right)[:, 0]
-                seen[j] = PairFeatures(part.pixels(left), part.descriptors(left), part.pixels(right), in_right)
+                pixels, in_right = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+                for right in rights:
+                    pixels, in_right = part.pixels(right), part.matches(left, right)[:, 0]
+                seen[j] = PairFeatures(part.pixels(left), part.descriptors(left), pixels, in_right)
         if seen:
             store_place(whole, rig, session, stamp_ns, seen)

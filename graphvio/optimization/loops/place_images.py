@@ -26,21 +26,19 @@ def write_image(path: Path, image: Image) -> None:
 
 def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> None:
     """Write all images of a frameset."""
-    for j, images in frameset.stereo.items():
-        pair = rig.pairs[j]
-        for camera, image in zip((pair.left, pair.right), images, strict=True):
+    for j, images in frameset.images.items():
+        for camera, image in zip(rig.groups[j].cameras, images, strict=True):
             write_image(folder / image_name(session, camera.name, frameset.stamp_ns), image)
 
 
 def read_place(folder: Path, rig: Rig, session: str, stamp_ns: int) -> FrameSet:
-    """Read the images of a place, of the pairs for which both files can be read."""
+    """Read the images of a place, of the pairs and single cameras of which all files can be read."""
     images = {}
-    for j, pair in enumerate(rig.pairs):
-        both = [
-            _read(folder / image_name(session, each.name, stamp_ns), each.size_px) for each in (pair.left, pair.right)
-        ]
-        if both[0] is not None and both[1] is not None:
-            images[j] = (both[0], both[1])
+    for j, group in enumerate(rig.groups):
+        read = [_read(folder / image_name(session, each.name, stamp_ns), each.size_px) for each in group.cameras]
+        found = tuple(image for image in read if image is not None)
+        if len(found) == len(read):
+            images[j] = found
     return FrameSet(stamp_ns, images)
 
 

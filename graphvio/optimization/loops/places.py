@@ -12,7 +12,7 @@ from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracks import PairFrame, usable_at
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.optimization.record import SessionRecord
-from graphvio.rig import StereoPair
+from graphvio.rig import Camera, StereoPair
 
 _LEVELS = 2  # of the pyramid, enough for stereo matching
 
@@ -42,6 +42,18 @@ def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) ->
     keyframes = np.flatnonzero(record.is_keyframe).tolist()
     chosen = [row for row in keyframes if chooser.takes(int(record.epoch[row]), record.smoothed[row])]
     return np.array(chosen, dtype=np.int64)
+
+
+class SingleObserver:
+    """Finds out which features in one single camera's image may be used."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self._allowed = UsablePixels(camera, config.tracking.window_px).always
+
+    def usable(self, pixels: Float) -> Bool:
+        """Return which pixels (N, 2) are inside the image and not masked."""
+        inside, usable = usable_at(pixels, self._allowed, 0.0)
+        return inside & usable
 
 
 class PairObserver:

@@ -1,32 +1,35 @@
-"""Stereo 3D-2D resection between two places, across any pairs.
+"""3D-2D resection between two places, across any pairs and single cameras.
 
-Points that pair a triangulated at the reference are seen by pair b at the current place. Each such (a, b) is treated as
-a pair of its own by the search and refinement of section 3.1, see `RigArrays.crossed`. SIFT features are accurate to
-about half a pixel; where a pair sees the same points at both places, their patches are then registered to a tenth.
+Points that pair a triangulated at the reference, or the motion to neighbouring places if a is a single camera, are seen
+by pair b at the current place. Each such (a, b) is treated as a pair of its own by the search and refinement of section
+3.1, see `RigArrays.crossed`. SIFT features are accurate to about half a pixel; where a pair sees the same points at
+both places, their patches are then registered to a tenth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.agreement import is_supported
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import predict_pixels
-from graphvio.frontend.refinement import Refined
+from graphvio.frontend.refinement import Refined, refine
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
+from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import FrameSet
+from graphvio.optimization.loops.motion_depth import FEATURE_SIGMA_PX
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
 
-_FEATURE_SIGMA_PX = 0.7  # of SIFT features instead of tracked corners
 _FEATURE_MAX_ERROR_PX = 4.0
 _ROUNDS = 2  # of registration, the second predicted from the motion of the first
 _MIN_REGISTERED = 30
@@ -41,6 +44,8 @@ class Resection:
     inliers: int  # number of points
     pairs: tuple[tuple[int, int], ...]  # (pair at the reference, pair at the current place) that saw the same points
     is_registered: bool  # whether patches were registered, not only features matched
+    # (6, 6), same tangent, by errors that all points have in common; it is no part of ``covariance``
+    shared_covariance: Float = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 def resect_features(
@@ -50,6 +55,7 @@ def resect_features(
     matches: Mapping[tuple[int, int], Int],
     config: Config,
     seed: Sequence[int],
+    shifts: Mapping[int, Float] | None = None,
 ) -> Resection | None:
     """Estimate the motion between two places from matched features; None if they do not support one.
 
@@ -60,17 +66,57 @@ def resect_features(
         matches: (a, b) -> matches (M, 2) of a's features at the reference and b's at the current place.
         config: of the motion.
         seed: of RANSAC.
+        shifts: single camera's index -> (S, K) of its inverse depths at the reference, for one standard deviation of
+            each of S errors that are common to all; None without single cameras.
     """
     crossings = sorted(matches)
     observations = _observations(reference, current, [(pair, matches[pair]) for pair in crossings])
-    settings = replace(config.motion, pixel_sigma_px=_FEATURE_SIGMA_PX, max_error_px=_FEATURE_MAX_ERROR_PX)
+    settings = replace(config.motion, pixel_sigma_px=FEATURE_SIGMA_PX, max_error_px=_FEATURE_MAX_ERROR_PX)
     if len(observations.pair) < settings.min_inliers:
         return None
     arrays = RigArrays.of(rig).crossed(crossings)
     refined = joint_motion(arrays, observations, np.eye(4), settings, np.random.default_rng(list(seed)))
     if not is_supported(refined.inlier, settings):
         return None
-    return _resection(refined, crossings, observations.pair, is_registered=False)
+    found = _resection(refined, crossings, observations.pair, is_registered=False)
+    if not shifts:
+        return found
+    kept = observations.of_rows(refined.inlier)
+    parts = [_shifts_of(reference[a], matches[a, b], shifts.get(a)) for a, b in crossings]
+    count = max(len(part) for part in parts)
+    of_kept = np.concatenate([part if len(part) else np.zeros((count, part.shape[1])) for part in parts], axis=1)
+    shared = _shared_covariance(arrays, kept, of_kept[:, refined.inlier], refined.cur_T_ref, settings)
+    return replace(found, shared_covariance=shared)
+
+
+def _shifts_of(reference: PairFrame, rows: Int, shifts: Float | None) -> Float:
+    """Return the shifts (S, M) of matched features that have a depth; of a pair's features (0, M)."""
+    rows = rows[reference.has_depth[rows[:, 0]], 0]
+    return np.zeros((0, len(rows))) if shifts is None else np.asarray(shifts[:, rows])
+
+
+def _shared_covariance(
+    rig: RigArrays, observations: Observations, shifts: Float, cur_T_ref: Float, settings: MotionConfig
+) -> Float:
+    """Return the covariance (6, 6), in body at the current place, by errors that shift the depths of all points.
+
+    Args:
+        rig: of the crossings.
+        observations: N inliers.
+        shifts: (S, N) of their inverse depths.
+        cur_T_ref: (4, 4) without shifts.
+        settings: of the motion.
+    """
+    covariance = np.zeros((6, 6))
+    for shift in shifts:
+        if not shift.any():
+            continue
+        points = observations.points.copy()
+        points[:, 2] += shift
+        moved = refine(rig, observations._replace(points=points), cur_T_ref, settings)
+        error = se3_log(np.ascontiguousarray(moved.cur_T_ref @ se3_inverse(cur_T_ref)))
+        covariance += np.outer(error, error)
+    return covariance
 
 
 def register_patches(
@@ -133,7 +179,7 @@ def _observations(
         then, now = reference[a], current[b]
         rows = rows[then.has_depth[rows[:, 0]]]
         one, other = rows[:, 0], rows[:, 1]
-        right: Bool = now.has_depth[other]
+        right: Bool = now.has_right[other]
         parts.append(
             Observations(
                 np.full(len(rows), number),

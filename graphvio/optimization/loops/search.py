@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,11 @@ from graphvio.arrays import AnyArray, Int
 from graphvio.config import Config
 from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
+from graphvio.optimization.loops.motion_depth import NEIGHBOURS, PlaceMotion, place_motion
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.retrieval import candidates, describe, vocabulary
-from graphvio.optimization.loops.verification import StoredView, crossings, verified
+from graphvio.optimization.loops.verification import StoredView, View, crossings, verified
+from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Rig
 from graphvio.sources import Source
 
@@ -29,6 +32,7 @@ class SessionInput:
     source: Source  # of its images
     rig: Rig  # of the cameras
     places: Sequence[Place]  # in the order of time
+    record: SessionRecord | None = None  # of its motions, by which single cameras' features get a depth
 
 
 def find_loops(
@@ -66,7 +70,7 @@ def find_loops(
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """N left images: number of the place (N,), pair (N,), names, and VLAD vectors (N, D)."""
+    """N left or single images: number of the place (N,), index of the group (N,), names, and VLAD vectors (N, D)."""
 
     place: Int
     pair: Int
@@ -81,9 +85,9 @@ def _described(
     sessions: Sequence[SessionInput], places: Sequence[Place], database: FeatureDatabase, seed: int
 ) -> _Images:
     listed = [
-        (number, j, image_name(sessions[place.session].name, pair.left.name, place.stamp_ns))
+        (number, j, image_name(sessions[place.session].name, group.left.name, place.stamp_ns))
         for number, place in enumerate(places)
-        for j, pair in enumerate(sessions[place.session].rig.pairs)
+        for j, group in enumerate(sessions[place.session].rig.groups)
     ]
     listed = [each for each in listed if each[2] in database.names]
     names = [each[2] for each in listed]
@@ -130,7 +134,8 @@ class _Verifier:
             with self._lock:
                 self._verified.append((then.name(a), now.name(b), rows, geometry))
 
-        found = verified(then, now, self._crossings(*candidate), observers, self._config, seed, keep)
+        neighbours = partial(self._neighbours, candidate[0])
+        found = verified(then, now, self._crossings(*candidate), observers, self._config, seed, neighbours, keep)
         return None if found is None else closure_of(earlier, later, found)
 
     def store(self) -> None:
@@ -138,6 +143,21 @@ class _Verifier:
         for first, second, rows, geometry in sorted(self._verified, key=lambda each: each[:2]):
             if not self._database.has_matches(first, second):
                 self._database.add_matches(first, second, rows, geometry)
+
+    def _neighbours(self, number: int) -> list[tuple[View, PlaceMotion]]:
+        """Return the places next to a place in its session, and the motions to them where they are known."""
+        place = self._places[number]
+        record = self._sessions[place.session].record
+        found: list[tuple[View, PlaceMotion]] = []
+        for step in NEIGHBOURS if record is not None else ():
+            if not 0 <= number + step < len(self._places) or self._places[number + step].session != place.session:
+                continue
+            other = self._places[number + step]
+            assert record is not None
+            motion = place_motion(record, place.row, other.row)
+            if motion is not None:
+                found.append((self._view(other), motion))
+        return found
 
     def _view(self, place: Place) -> StoredView:
         session = self._sessions[place.session]

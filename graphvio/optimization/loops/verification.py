@@ -17,29 +17,38 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import PairFeatures
 from graphvio.optimization.loops.matching import alike, estimated_geometry
+from graphvio.optimization.loops.motion_depth import Features, Located, PlaceMotion, undetermined
+from graphvio.optimization.loops.motion_depth import located as located_by_motion
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import Resection, register_patches, resect_features
-from graphvio.rig import Rig, StereoPair
+from graphvio.rig import CameraGroup, Rig, SingleCamera
 
 _MIN_MATCHES = 20
 _MAX_CROSSINGS = 2  # pairs of images of a candidate that are matched
 
 
 class View(Protocol):
-    """A place whose features may be in memory or in a database."""
+    """A place whose features may be in memory or in a database; j is an index in the rig's groups."""
 
     @property
     def rig(self) -> Rig:
         """Rig that took the images."""
 
+    def sees(self, j: int) -> bool:
+        """Return whether there is such an image."""
+
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """Return pixels (K, 2) and descriptors (K, 128), uint8, of pair j's left image."""
+        """Return pixels (K, 2) and descriptors (K, 128), uint8, of the left image, or of a single camera's."""
 
     def frame(self, j: int) -> PairFrame:
-        """Return the same features with their depth."""
+        """Return the same features with their depth; those of a single camera have none."""
 
     def frameset(self) -> FrameSet:
-        """Return the place's images, of the pairs whose images still exist."""
+        """Return the place's images, as far as they still exist."""
+
+
+Neighbours = Callable[[], Sequence[tuple[View, PlaceMotion]]]
+"""Returns the places of the same rig next to a place, and the motions from it to them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +63,12 @@ class StoredView:
     frameset_at: Callable[[int], FrameSet]
 
     def name(self, j: int) -> str:
-        """Return the name of pair j's left image in the database."""
-        return image_name(self.session, self.rig.pairs[j].left.name, self.stamp_ns)
+        """Return the name of the left image in the database, or of a single camera's."""
+        return image_name(self.session, self.rig.groups[j].left.name, self.stamp_ns)
+
+    def sees(self, j: int) -> bool:
+        """See `View`."""
+        return self.name(j) in self.database.names
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
         """See `View`."""
@@ -65,12 +78,14 @@ class StoredView:
 
     def frame(self, j: int) -> PairFrame:
         """See `View`."""
-        pair, left = self.rig.pairs[j], self.name(j)
-        right = image_name(self.session, pair.right.name, self.stamp_ns)
+        group, left = self.rig.groups[j], self.name(j)
+        if isinstance(group, SingleCamera):
+            return undetermined(group.left, self.stamp_ns, self.features(j)[0])
+        right = image_name(self.session, group.right.name, self.stamp_ns)
         with self.lock:
             pixels, in_right = self.database.pixels(left), self.database.pixels(right)
             rows = self.database.matches(left, right)
-        return frame_of(pair, self.stamp_ns, pixels, in_right, rows)
+        return frame_of(group, self.stamp_ns, pixels, in_right, rows)
 
     def frameset(self) -> FrameSet:
         """See `View`."""
@@ -83,7 +98,11 @@ class FreshView:
 
     rig: Rig
     images: FrameSet
-    seen: Mapping[int, PairFeatures]  # by pair
+    seen: Mapping[int, PairFeatures]  # by the index in the rig's groups
+
+    def sees(self, j: int) -> bool:
+        """See `View`."""
+        return j in self.seen
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
         """See `View`."""
@@ -92,7 +111,7 @@ class FreshView:
     def frame(self, j: int) -> PairFrame:
         """See `View`."""
         seen = self.seen[j]
-        return frame_of(self.rig.pairs[j], self.images.stamp_ns, seen.left, seen.right, seen.rows)
+        return frame_of(self.rig.groups[j], self.images.stamp_ns, seen.left, seen.right, seen.rows)
 
     def frameset(self) -> FrameSet:
         """See `View`."""
@@ -110,7 +129,8 @@ def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: An
 
 def verified(
     earlier: View, later: View, tried: Sequence[tuple[int, int]], observers: Sequence[PairObserver] | None,
-    config: Config, seed: Sequence[int], on_matched: Callable[[int, int, Int, Any], None] | None = None,
+    config: Config, seed: Sequence[int], neighbours: Neighbours,
+    on_matched: Callable[[int, int, Int, Any], None] | None = None,
 ) -> Resection | None:  # fmt: skip
     """Estimate the motion between two places that may be the same; None if they have too little in common.
 
@@ -121,6 +141,7 @@ def verified(
         observers: of the rig's pairs, to register patches; None if the rigs differ.
         config: of the search and the motion.
         seed: of RANSAC.
+        neighbours: of the earlier place, from which the depth of single cameras' features is triangulated.
         on_matched: called with a, b, their matches (M, 2), and the two-view geometry that verifies them.
     """
     matches = {}
@@ -136,9 +157,11 @@ def verified(
         matches[a, b] = inliers
     if not matches:
         return None
-    reference = {a: earlier.frame(a) for a, _ in matches}
+    located = {a: _with_depth(earlier, a, neighbours) for a, _ in matches}
+    reference = {a: each.frame for a, each in located.items()}
+    shifts = {a: each.shifts for a, each in located.items() if len(each.shifts)}
     current = {b: later.frame(b) for _, b in matches}
-    found = resect_features(later.rig, reference, current, matches, config, seed)
+    found = resect_features(later.rig, reference, current, matches, config, seed, shifts)
     if found is None or found.inliers < config.optimization.loop_min_inliers:
         return None
     if observers is not None:
@@ -153,12 +176,23 @@ def _matched(earlier: View, later: View, a: int, b: int) -> tuple[Int, Any]:
     rows = alike(first_descriptors, second_descriptors)
     if len(rows) < _MIN_MATCHES:
         return rows, None
-    cameras = (earlier.rig.pairs[a].left, later.rig.pairs[b].left)
+    cameras = (earlier.rig.groups[a].left, later.rig.groups[b].left)
     return rows, estimated_geometry(cameras, (first, second), rows)
 
 
-def frame_of(pair: StereoPair, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> PairFrame:
+def _with_depth(view: View, j: int, neighbours: Neighbours) -> Located:
+    """Return a place's features with their depth, those of a single camera by motion."""
+    frame, group = view.frame(j), view.rig.groups[j]
+    if not isinstance(group, SingleCamera):
+        return Located(frame, np.zeros((0, len(frame.ids))))
+    others = [(Features(*other.features(j)) if other.sees(j) else None, motion) for other, motion in neighbours()]
+    return located_by_motion(group.left, frame.stamp_ns, Features(*view.features(j)), others)
+
+
+def frame_of(pair: CameraGroup, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> PairFrame:
     """Return a frame of features (K, 2) of a left image, with depth where rows (M, 2) match the right one's."""
+    if isinstance(pair, SingleCamera):
+        return undetermined(pair.left, stamp_ns, pixels)
     n = len(pixels)
     left, has_ray = pair.left.unproject(pixels)
     right, right_pixels = np.zeros((n, 2)), np.zeros((n, 2))
