@@ -4,9 +4,21 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import calibration, consistency, endurance, lags, live, mapping, outages, rates, real_imu, soak
+from campaigns import (
+    calibration,
+    consistency,
+    endurance,
+    lags,
+    live,
+    mapping,
+    outages,
+    rates,
+    real_imu,
+    self_calibration,
+    soak,
+)  # fmt: skip
 
-_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration, live, soak, mapping)
+_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration, self_calibration, live, soak, mapping)
 
 if __name__ == "__main__":
     sys.exit(

@@ -1,4 +1,4 @@
-"""Tracks of a rig that walks through a cloud of points, without images: for tests of the self-calibration."""
+"""Tracks of a rig that walks through a cloud of points, without images: for the self-calibration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.geometry import so3_log
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.online import SelfCalibration
+from graphvio.self_calibration.parameters import BODY, DISTORTION, PAIR, STEREO, RigCalibration
 from graphvio.self_calibration.window import View
 from graphvio.simulation.imu import measure
 from graphvio.simulation.scenes import build_scene
@@ -69,15 +71,34 @@ class Walk:
             yield round(k * 1e9 / RATE_HZ), pose, self.views(pose)
 
     def samples(self, duration_s: float) -> list[ImuSample]:
-        """Return IMU samples of the walk; at a speed of 1 only."""
+        """Return IMU samples of the walk, by the IMU's clock; at a speed of 1 only."""
         assert self.rig.imu is not None
         times_s = np.arange(0.0, duration_s, 1.0 / self.rig.imu.rate_hz)
         stamps_ns = np.round(times_s * 1e9).astype(np.int64)
         track = measure(self._motion, self.rig.imu, times_s, stamps_ns, self.seed)
         return [
             ImuSample(int(stamp), rate, force)
-            for stamp, rate, force in zip(stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True)
+            for stamp, rate, force in zip(
+                track.stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True
+            )
         ]
+
+
+def true_difference(written: Rig, true: Rig) -> Float:
+    """Return the true difference (C,) of the cameras' parameters from the written calibration."""
+    nominal, exact = RigCalibration.of(written), RigCalibration.of(true)
+    rows = np.zeros((len(written.pairs), PAIR))
+    for j in range(len(rows)):
+        cameras = np.hstack(
+            [exact.intrinsics[j] - nominal.intrinsics[j], (exact.distortion - nominal.distortion)[j, :, :DISTORTION]]
+        )
+        rows[j, :STEREO] = cameras.ravel()
+        stereo_R, body_R = (getattr(nominal, name)[j, :3, :3] for name in ("right_T_left", "body_T_left"))
+        rows[j, STEREO : STEREO + 3] = so3_log(np.ascontiguousarray(stereo_R.T @ exact.right_T_left[j, :3, :3]))
+        rows[j, STEREO + 3 : BODY] = exact.right_T_left[j, :3, 3] - nominal.right_T_left[j, :3, 3]
+        rows[j, BODY : BODY + 3] = so3_log(np.ascontiguousarray(exact.body_T_left[j, :3, :3] @ body_R.T))
+        rows[j, BODY + 3 :] = exact.body_T_left[j, :3, 3] - nominal.body_T_left[j, :3, 3]
+    return rows.ravel()
 
 
 def calibrated(calibration: SelfCalibration, walk: Walk, duration_s: float) -> SelfCalibration:
