@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import typer
 from recordings import half_size_rig
+from rendered import modules_that_write
 from typer.testing import CliRunner
 
+from graphvio import simulation
 from graphvio.cli.simulate import simulate as simulate_command
 from graphvio.errors import SourceError
 from graphvio.rig_files import load_rig
@@ -128,3 +130,14 @@ def test_command_lists_scenes(tmp_path: Path) -> None:
     assert isinstance(result.exception, SourceError)
     for name in ("room", "corridor", "stairs", "loop", "calibration"):
         assert name in str(result.exception)
+
+
+def test_recordings_are_kept_for_as_long_as_what_writes_them_is_the_same() -> None:
+    """Tests render again after a change of any module of the simulator, and not after one of what reads."""
+    found = set(modules_that_write())
+    root = Path(simulation.__file__).parent
+    modules = {path.relative_to(root).with_suffix("") for path in root.rglob("*.py")}
+    written_by = {f"graphvio.simulation.{'.'.join(each.parts)}" for each in modules if each.name != "__init__"}
+    assert written_by - found == {"graphvio.simulation.named_rigs"}  # of the command line
+    assert {"graphvio.cameras", "graphvio.rig", "graphvio.kernels", "graphvio.sessions.euroc_layout"} < found
+    assert not {"graphvio.errors", "graphvio.wording", "graphvio.rig_files.reading"} & found
