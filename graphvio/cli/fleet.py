@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,6 +15,20 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from graphvio.fleet.run import FleetProgress
+    from graphvio.fleet.table import Outcome
+
+_Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        help="A Dask scheduler that runs, such as tcp://host:8786.  [default: workers on this machine]",
+        metavar="ADDRESS",
+    ),
+]
+_Workers = Annotated[
+    int | None,
+    typer.Option("--workers", help="Processes on this machine.  [default: half its cores, and two at least]", min=1),
+]
 
 fleet = typer.Typer(help="Many sessions side by side, on this machine or on a Dask cluster.", no_args_is_help=True)
 
@@ -39,20 +54,8 @@ def optimize(
             "--out", help="Folder for the results, path or URL: new, or that of a run to continue.", metavar="DIR"
         ),
     ],
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            "--scheduler",
-            help="A Dask scheduler that runs, such as tcp://host:8786.  [default: workers on this machine]",
-            metavar="ADDRESS",
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            "--workers", help="Processes on this machine.  [default: half its cores, and two at least]", min=1
-        ),
-    ] = None,
+    scheduler: _Scheduler = None,
+    workers: _Workers = None,
     rig: options.RigFile = None,
     topics: options.Topics = None,
     config: options.ConfigName = "default",
@@ -80,7 +83,6 @@ def optimize(
         graphvio fleet optimize list.txt --out s3://bucket/results --scheduler tcp://10.0.0.5:8786
     """
     import logging
-    from dataclasses import asdict
 
     from graphvio.config import Config
     from graphvio.errors import FleetError
@@ -122,14 +124,21 @@ def optimize(
     except KeyboardInterrupt:
         warn(f"interrupted; the same command with --out {out} continues from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    if not _print_outcomes(outcomes, out):
+        raise typer.Exit(EXIT_INCOMPLETE)
+
+
+def _print_outcomes(outcomes: Sequence[Outcome], out: str) -> bool:
+    """Print how each session ended, and return whether none failed."""
+    from dataclasses import asdict
+
     publish({"results": out, "sessions": [asdict(each) | {"status": each.status} for each in outcomes]})
     failed = [each for each in outcomes if each.error]
     for each in failed:
         warn(f"{each.name} failed in {each.failed_in}: {each.error}")
     typer.echo(f"{len(outcomes) - len(failed)} of {len(outcomes)} sessions optimised")
     typer.echo(f"results: {out}")
-    if failed:
-        raise typer.Exit(EXIT_INCOMPLETE)
+    return not failed
 
 
 def _bars() -> Progress:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.live import run_live
+from graphvio.cli.live_run import run_live
 
 
 def serve(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import framesets_bar
+
+if TYPE_CHECKING:
+    from graphvio.simulation.recording import SimulatedRecording
 
 
 def simulate(
@@ -93,18 +96,14 @@ def simulate(
     with framesets_bar() as bar:
         task = bar.add_task(f"rendering {name}", total=None)
         recording = simulate_recording(
-            name,
-            out,
-            duration_s=duration,
-            seed=seed,
-            rate_hz=rate,
-            trigger_offset_ms=trigger_offset_ms,
-            calibration_error=error,
-            calibration_seed=calibration_seed,
-            rig_change=rig_change,
-            rig=rig_of(rig),
+            name, out, duration_s=duration, seed=seed, rate_hz=rate, trigger_offset_ms=trigger_offset_ms,
+            calibration_error=error, calibration_seed=calibration_seed, rig_change=rig_change, rig=rig_of(rig),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+        )  # fmt: skip
+    _print_recording(recording)
+
+
+def _print_recording(recording: SimulatedRecording) -> None:
     publish(recording)
     typer.echo(
         f"{recording.path}: {recording.framesets} framesets, {recording.images} images, "

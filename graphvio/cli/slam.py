@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.live import run_live
+from graphvio.cli.live_run import run_live
 from graphvio.cli.services import Services, Started
 
 if TYPE_CHECKING:
