@@ -69,7 +69,6 @@ _MORE_STEPS = 60  # polynomials of high degree approach their solution slowly fr
 _NEWTON_TOLERANCE = 1e-12
 _BISECTIONS = 20
 _CHECKS = 8
-_ROUNDING = 1e-6
 
 
 @kernel
@@ -387,51 +386,3 @@ def unproject_pixels(model: int, intrinsics: Float, distortion: Float, pixels: F
 def central_scale(model: int, distortion: Float) -> float:
     """Return by what the lens scales normalised coordinates around the optical axis, tangential distortion aside."""
     return 1.0 / (1.0 + float(distortion[0])) if model in (DOUBLE_SPHERE, OMNIDIRECTIONAL) else 1.0
-
-
-def lens_fault(model: str, distortion: Float) -> str:
-    """Say what is wrong with coefficients, and what to do; empty if nothing is.
-
-    Args:
-        model: its name.
-        distortion: (8,).
-    """
-    names = COEFFICIENTS[model]
-    order = f"give {model} the coefficients {', '.join(names)} in this order"
-    too_many = np.abs(distortion[len(names) :]) > _ROUNDING
-    if too_many.any():
-        last = len(names) + int(np.flatnonzero(too_many)[-1]) + 1
-        return f"has {last} distortion coefficients, and {model} has {len(names)}; {order}"
-    of = dict(zip(names, distortion.tolist(), strict=False))
-    if not 0.0 <= of.get("alpha", 0.0) <= 1.0:
-        return f"alpha is {of['alpha']:g}, and must be between 0 and 1; {order}"
-    if not of.get("beta", 1.0) > 0.0:
-        return f"beta is {of['beta']:g}, and must be positive; {order}"
-    if not of.get("xi", 0.0) > -1.0:
-        return f"xi is {of['xi']:g}, and must be more than -1; {order}"
-    if model == "double-sphere" and of["xi"] > 1.0:
-        return f"xi is {of['xi']:g}, and must be at most 1; {order}"
-    return ""
-
-
-def view_fault(model: str, intrinsics: Float, distortion: Float, size_px: tuple[int, int]) -> str:
-    """Say which corner of the image no ray reaches by the model, however wide, and what to do; empty if there is none.
-
-    Args:
-        model: its name; with ``radial-tangential`` and ``equidistant`` nothing is tested.
-        intrinsics: (4,) pixels.
-        distortion: (8,).
-        size_px: (width, height).
-    """
-    number = MODEL_NAMES[model]
-    if number in (RADIAL_TANGENTIAL, EQUIDISTANT):
-        return ""
-    fx, fy, cx, cy = intrinsics.tolist()
-    for u in (0, size_px[0] - 1):
-        for v in (0, size_px[1] - 1):
-            if not ray_of(number, distortion, (u - cx) / fx, (v - cy) / fy)[3]:
-                return (
-                    f"no ray reaches the image's corner ({u}, {v}) by its {model} lens; check intrinsics, size and "
-                    f"coefficients ({', '.join(COEFFICIENTS[model])}), or give a mask if the corners are black"
-                )
-    return ""

@@ -26,12 +26,11 @@ from graphvio.cameras import (
     distort,
     distortion_basis,
     fold_radius,
-    lens_fault,
     project_points,
     undistort,
     unproject_pixels,
-    view_fault,
 )
+from graphvio.rig.lens_checks import lens_fault, view_fault
 
 
 def filled(*coefficients: float) -> Float:

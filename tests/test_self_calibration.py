@@ -20,6 +20,7 @@ from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration import online
+from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
 from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
 from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, _scratch, eliminate_landmarks
@@ -391,7 +392,7 @@ def test_self_calibration_in_a_new_frame_of_poses_begins_another_window() -> Non
 @pytest.mark.parametrize("failure", ["raises", "is NaN"])
 def test_self_calibration_leaves_out_what_cannot_be_solved(failure: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = default_rig().without_imu()
-    solve_window, count = online.adjusted, 0
+    solve_window, count = adjusted, 0
 
     def fails_at_first(*arguments: Any) -> Solution:
         nonlocal count

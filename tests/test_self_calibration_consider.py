@@ -6,9 +6,9 @@ from walked_views import Walk
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.evidence import Gaussian
-from graphvio.self_calibration.online import adjusted
 from graphvio.self_calibration.parameters import PAIR, STEREO, RigCalibration
 from graphvio.self_calibration.prior import file_prior
 from graphvio.self_calibration.window import Keyframe

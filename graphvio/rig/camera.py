@@ -13,12 +13,12 @@ from graphvio.cameras import (
     MODEL_NAMES,
     N_COEFFICIENTS,
     central_scale,
-    lens_fault,
     project_points,
     unproject_pixels,
 )
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
+from graphvio.rig.lens_checks import lens_fault
 from graphvio.rig.values import checked_transform, finite, set_value
 
 _ROUNDING = 1e-14

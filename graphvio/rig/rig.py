@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import FACTORY, CalibrationSigmas
-from graphvio.cameras import view_fault
 from graphvio.errors import RigError
 from graphvio.rig.camera import Camera
 from graphvio.rig.groups import CameraGroup, SingleCamera, StereoPair
 from graphvio.rig.imu import Imu
+from graphvio.rig.lens_checks import view_fault
 from graphvio.rig.values import set_value
 
 if TYPE_CHECKING:

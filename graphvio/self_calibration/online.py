@@ -19,6 +19,7 @@ from graphvio.kernels import await_compilers
 from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
+from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
@@ -27,12 +28,11 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 from graphvio.self_calibration.prior import CAMERAS, extrinsic_covariances, file_prior, walk_per_second
-from graphvio.self_calibration.solver import Solution, States, Window, solve
-from graphvio.self_calibration.window import Keyframe, View, choose_tracks, median_displacement_px, stationary
+from graphvio.self_calibration.solver import Solution
+from graphvio.self_calibration.window import Keyframe, View, median_displacement_px
 
 _WINDOW = 16  # keyframes
 _MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe: a standstill has no keyframes
-_MAX_TRACKS = 150  # of each pair
 _FIRST_SIGMA_PX = 0.15
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
@@ -47,10 +47,7 @@ _MIN_CONFIRMING = 2  # full windows; one is at times off by more than its covari
 WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
-_MAX_SELECTIONS = 2  # of the landmarks that stand still
-_CONSENSUS, _ALL = 0.5, 0.98  # shares of them, between which the others are left out
 _MAX_IMU_GAP_NS = 50_000_000
-_MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
 _KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
 
@@ -368,39 +365,6 @@ class SelfCalibration:
             _IMU_NOISE_FACTOR * np.array([imu.gyro_noise_density, imu.accel_noise_density]),
             _MAX_IMU_GAP_NS,
         )
-
-
-def adjusted(
-    keyframes: tuple[Keyframe, ...],
-    samples: InertialSamples | None,
-    nominal: RigCalibration,
-    difference: Float,
-    prior: Gaussian,
-    sigma_px: float,
-) -> Solution:
-    """Adjust a window, beginning at the odometry's poses and at a difference from the nominal calibration."""
-    poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
-    stamps_s = np.array([(keyframe.stamp_ns - keyframes[0].stamp_ns) * 1e-9 for keyframe in keyframes])
-    calibration = nominal.moved(difference[: PAIR * len(nominal.models)])
-    tracks, landmarks = choose_tracks(keyframes, poses, calibration, _MAX_TRACKS)
-    positions = poses[:, :3, 3]
-    velocities = np.gradient(positions, stamps_s, axis=0) if len(poses) > 1 else np.zeros_like(positions)
-    states = States(poses, velocities, np.array([0.0, 0.0, -GRAVITY_M_S2]), landmarks)
-    if samples is not None:
-        samples = samples.without(samples.intervals_with_spikes())
-    solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
-    for _ in range(_MAX_SELECTIONS):
-        # Poses are free, and a crowd takes them along: from where they began, the others decide.
-        stands = stationary(tracks, solution.errors2)
-        if not _CONSENSUS < np.mean(stands) < _ALL:
-            break
-        tracks, states = tracks.of(stands), states._replace(landmarks=states.landmarks[stands])
-        solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
-    if samples is not None and (solution.imu_errors2 > _MAX_IMU_ERROR2).any():
-        # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
-        believed = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
-        solution = solve(Window(tracks, sigma_px, believed), states, nominal, difference, prior)
-    return solution
 
 
 def adjust_nothing(rig: Rig) -> None:

@@ -1,0 +1,63 @@
+"""Adjustment of one window of keyframes: what the tracks and IMU samples that agree say of poses and calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.self_calibration.evidence import Gaussian
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.parameters import PAIR, RigCalibration
+from graphvio.self_calibration.solver import Solution, States, Window, solve
+from graphvio.self_calibration.window import Keyframe, choose_tracks, stationary
+
+_MAX_TRACKS = 150  # of each pair
+_MAX_SELECTIONS = 2  # of the landmarks that stand still
+_CONSENSUS, _ALL = 0.5, 0.98  # shares of them, between which the others are left out
+_MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
+
+
+def adjusted(
+    keyframes: tuple[Keyframe, ...],
+    samples: InertialSamples | None,
+    nominal: RigCalibration,
+    difference: Float,
+    prior: Gaussian,
+    sigma_px: float,
+) -> Solution:
+    """Adjust a window, beginning at the odometry's poses and at a difference from the nominal calibration.
+
+    Args:
+        keyframes: of the window, in time order.
+        samples: of the IMU over it, or None.
+        nominal: calibration of the rig file.
+        difference: (C,) of the calibration from it, to begin at.
+        prior: of that difference.
+        sigma_px: noise of a corner's position.
+
+    Returns:
+        States, calibration and their covariance, without landmarks that move and samples that are wild.
+    """
+    poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
+    stamps_s = np.array([(keyframe.stamp_ns - keyframes[0].stamp_ns) * 1e-9 for keyframe in keyframes])
+    calibration = nominal.moved(difference[: PAIR * len(nominal.models)])
+    tracks, landmarks = choose_tracks(keyframes, poses, calibration, _MAX_TRACKS)
+    positions = poses[:, :3, 3]
+    velocities = np.gradient(positions, stamps_s, axis=0) if len(poses) > 1 else np.zeros_like(positions)
+    states = States(poses, velocities, np.array([0.0, 0.0, -GRAVITY_M_S2]), landmarks)
+    if samples is not None:
+        samples = samples.without(samples.intervals_with_spikes())
+    solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
+    for _ in range(_MAX_SELECTIONS):
+        # Poses are free, and a crowd takes them along: from where they began, the others decide.
+        stands = stationary(tracks, solution.errors2)
+        if not _CONSENSUS < np.mean(stands) < _ALL:
+            break
+        tracks, states = tracks.of(stands), states._replace(landmarks=states.landmarks[stands])
+        solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
+    if samples is not None and (solution.imu_errors2 > _MAX_IMU_ERROR2).any():
+        # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
+        believed = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
+        solution = solve(Window(tracks, sigma_px, believed), states, nominal, difference, prior)
+    return solution
