@@ -39,7 +39,7 @@ def fast_math_compiler(flags: frozenset[str]) -> type[Compiler]:
 
     class _Compiler(Compiler):  # type: ignore[misc]
         def define_pipelines(self) -> list[Any]:
-            pipelines = super().define_pipelines()
+            pipelines: list[Any] = super().define_pipelines()
             for pipeline in pipelines:
                 pipeline.passes = [
                     (_Lowering if each is NativeLowering else each, why) for each, why in pipeline.passes

@@ -14,6 +14,7 @@ from graphvio.config import Config
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.sensors import FrameSet
+from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import Step
 from graphvio.results import ResultWriter, Summary
@@ -69,6 +70,7 @@ class RunListener:
         on_event: takes each event of the odometry.
         on_calibration: takes each calibration that came into force, with the stamp of the frameset.
         on_smoothed: takes stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window.
+        on_views: takes the views of landmarks by a rig of single cameras only, see `graphvio.Odometry.on_views`.
         on_progress: takes the progress after each frameset.
     """
 
@@ -77,6 +79,7 @@ class RunListener:
     on_event: Callable[[Event], None] = _ignore
     on_calibration: Callable[[int, CalibrationEstimate], None] = _ignore
     on_smoothed: Callable[[Sequence[tuple[int, Float]]], None] = _ignore
+    on_views: Callable[[WindowViews | FirstWindow], None] = _ignore
     on_progress: Callable[[Progress], None] = _ignore
 
 
@@ -110,6 +113,8 @@ class _Run:
         self._odometry = Odometry(rig, config)
         for listener in listeners:
             self._odometry.subscribe(listener.on_step)
+            if listener.on_views is not _ignore:
+                self._odometry.on_views(listener.on_views)
         self._writer = writer
         self._listeners = listeners
         self._keeps_framesets = any(listener.on_estimate is not _ignore for listener in listeners)

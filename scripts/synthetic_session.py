@@ -9,8 +9,10 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.optimization.first_windows import FirstWindows
 from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.record import Inertial, Motions, SessionRecord
+from graphvio.optimization.views import Views
 from graphvio.rig import Imu
 from graphvio.simulation.imu import ImuTrack, measure
 from graphvio.simulation.motion import Motion
@@ -95,6 +97,8 @@ def make_session(
         own=own,
         own_pair=own_pair,
         inertial=_inertial(track, rows),
+        views=Views.of([], {}),
+        first_windows=FirstWindows.of([], {}),
     )
     false = round(false_share * loops)
     closures = [_true_loop(record, truth, rng, session) for _ in range(loops - false)]

@@ -22,6 +22,7 @@ from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
 from graphvio.optimization.extrinsics import RigCorrection
+from graphvio.optimization.first_windows import FirstWindows
 from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import Inertial, Motions, SessionRecord
@@ -29,6 +30,7 @@ from graphvio.optimization.report.calibration import calibrations
 from graphvio.optimization.report.page import length, plain
 from graphvio.optimization.report.write import write_plan, write_report
 from graphvio.optimization.solver import Residuals
+from graphvio.optimization.views import Views
 from graphvio.trajectory import Trajectory
 
 POSES, LAP = 120, 60
@@ -82,6 +84,8 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
         own=Motions(*none),
         own_pair=np.zeros(0, dtype=np.int64),
         inertial=Inertial(np.zeros(POSES + 1, dtype=np.int64), no, np.zeros(0), np.zeros((0, 6))),
+        views=Views.of([], {}),
+        first_windows=FirstWindows.of([], {}),
     )
 
 

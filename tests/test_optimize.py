@@ -14,17 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_walks import recorded, with_wrong_place
+from calibration_walks import recorded, walk_simulator, with_wrong_place
 from typer.testing import CliRunner, Result
+from undrawn import undrawn
 
 from graphvio import open_source
 from graphvio.arrays import Float
 from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.errors import MissingExtraError, OptimizationError
-from graphvio.geometry import se3_inverse, se3_log
+from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.optimization.loops.closures import load_closures
 from graphvio.optimization.loops.database import FeatureDatabase
+from graphvio.optimization.optimize import optimize
 from graphvio.optimization.pipeline import DATABASE, Session, Stages, optimize_sessions
+from graphvio.optimization.record import SessionRecord
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -89,6 +93,69 @@ def test_optimize_rendered_walk_improves_on_online(done: Path) -> None:
         assert (done / name).stat().st_size > 100, name
     trajectory = load_trajectory(done / "trajectory_optimized.txt")
     assert len(trajectory) == session["framesets"]
+
+
+@pytest.fixture(scope="module")
+def of_one_camera(walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of the same walk by one camera and the IMU."""
+    out = tmp_path_factory.mktemp("one-camera") / "walk"
+    with undrawn():
+        finished = command(walk, "--cameras", "0", "--no-pairs", "--config", settings, "--out", out)
+    assert finished.exit_code == 0, finished.output
+    return out
+
+
+def test_optimize_one_camera_improves_on_online(of_one_camera: Path) -> None:
+    summary = json.loads((of_one_camera / "summary.json").read_text())
+    (session,) = summary["sessions"]
+    errors = {name: each["position_m"] for name, each in session["ate_rmse"].items()}
+    assert errors["optimized"] < 0.5 * min(errors["online"], errors["smoothed"])
+    assert errors["optimized"] < 0.003
+    assert summary["loops"]["used"] >= 5
+    assert summary["loops"]["refused"] == 0
+    assert summary["loops"]["error_of_used"]["optimized"]["rmse_m"] < 0.008
+    assert session["framesets"] == len(load_trajectory(of_one_camera / "trajectory_optimized.txt"))
+
+
+@pytest.mark.parametrize("with_loops", [False, True])
+def test_optimize_one_camera_is_consistent(of_one_camera: Path, walk: Path, with_loops: bool) -> None:
+    """Where position and heading are those of the first state."""
+    source, record = open_source(walk), SessionRecord.load(of_one_camera / "walk/record.npz")
+    closures = load_closures(of_one_camera / "loops.npz") if with_loops else []
+    (session,) = optimize([record], [source.rig.imu], closures, Config()).sessions
+    assert source.truth is not None
+    known, is_known = load_trajectory(source.truth).at(session.nodes.stamps_ns, 0.1)
+    assert is_known.all()
+    truth = known.nav_T_body
+    poses = session.nav_T_body[session.nodes.rows]
+    turn = poses[0, :3, :3] @ truth[0, :3, :3].T
+    heading = np.arctan2(turn[1, 0], turn[0, 0])
+    nav_T_world = se3(so3_exp(np.array([0.0, 0.0, heading])), np.zeros(3))
+    nav_T_world[:3, 3] = poses[0, :3, 3] - nav_T_world[:3, :3] @ truth[0, :3, 3]
+    squares = []
+    for pose, true, covariance in zip(poses[1:], truth[1:], session.covariance[1:], strict=True):
+        error = se3_log(np.ascontiguousarray(se3_inverse(pose) @ nav_T_world @ true))
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(squares) < 9.0
+
+
+def test_optimize_one_camera_writes_points_on_true_surfaces(of_one_camera: Path, walk: Path) -> None:
+    model = pycolmap.Reconstruction(of_one_camera / "colmap/sparse/0")
+    assert {image.name.split("/")[1] for image in model.images.values()} == {"cam0"}
+    assert model.num_rigs() == model.num_cameras() == 1
+    simulator = walk_simulator(SECONDS, to_and_fro)
+    row_of = {int(stamp): row for row, stamp in enumerate(simulator.stamps_ns)}
+    errors = []
+    for name in sorted(image.name for image in model.images.values())[::4]:
+        image = model.find_image_with_name(name)
+        depth, cam_T_world = simulator.view(row_of[int(Path(name).stem)], 0).depth, image.cam_from_world()
+        for each in image.points2D:
+            if each.has_point3D():
+                u, v = np.round(each.xy - 0.5).astype(int)
+                errors.append((cam_T_world * model.point3D(each.point3D_id).xyz)[2] / depth[v, u] - 1.0)
+    assert len(errors) > 300
+    assert np.median(np.abs(errors)) < 0.02
+    assert np.mean(np.abs(errors) > 0.1) < 0.05
 
 
 @pytest.mark.usefixtures("without_plots")

@@ -47,6 +47,8 @@ def optimize(
         ),
     ] = None,
     pairs: options.Pairs = None,
+    cameras: options.Cameras = None,
+    no_pairs: options.NoPairs = False,
     no_imu: options.NoImu = False,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     refine_calibration: Annotated[
@@ -59,7 +61,7 @@ def optimize(
 ) -> None:
     """Optimise the trajectory of recorded sessions from all their measurements.
 
-    Runs the odometry, finds places that are seen again, by any pair, and optimises everything as one graph. Several
+    Runs the odometry, finds places that are seen again, by any camera, and optimises everything as one graph. Several
     sessions of one place are brought into one frame. An interrupted run is continued by the same command with the same
     --out.
 
@@ -71,6 +73,8 @@ def optimize(
         graphvio optimize walk --out walk-optimized
 
         graphvio optimize monday.mcap tuesday.mcap --out both
+
+        graphvio optimize walk --cameras 0 --no-pairs
     """
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
@@ -83,11 +87,22 @@ def optimize(
         colmap()  # before hours of work, not after
     settings = Config.load(config)
     opened = [
-        open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+        open_recording(
+            source,
+            rig,
+            settings,
+            pairs=pairs,
+            cameras=cameras,
+            no_pairs=no_pairs,
+            no_imu=no_imu,
+            from_s=from_s,
+            to_s=to_s,
+            topics=topics,
+        )
         for source in sources
     ]
-    for source in opened:
-        source.rig.need_pairs("graphvio optimize")
+    for source in opened if refine_calibration else []:
+        source.rig.need_pairs("graphvio optimize --refine-calibration")
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")

@@ -15,6 +15,7 @@ from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp, so3_log
 from graphvio.linear_algebra import cholesky, product, solve_lower, solve_rows, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.measurements.window_views import FirstWindow
 from graphvio.monocular.structure import (
     Cameras,
     Eliminated,
@@ -211,6 +212,28 @@ def adjust(measured: Measurements, states: States, landmarks: Float, prior: Prio
     return Adjusted(states, landmarks, at)
 
 
+def views_only(
+    cameras: Cameras, structure: Structure, sigma_px: float, states: States, landmarks: Float
+) -> tuple[Float, Float]:
+    """Linearise what views alone say of the poses, for any places of the landmarks.
+
+    Args:
+        cameras: of the rig.
+        structure: of the views.
+        sigma_px: noise of a corner's position.
+        states: K of them.
+        landmarks: (L, 3), from which their best places for these poses are found.
+
+    Returns:
+        Information (6 K, 6 K) and gradient (6 K,).
+    """
+    landmarks = located(states.poses, cameras, landmarks, structure, sigma_px, True)
+    information, gradient, _, _ = visual_equations(
+        states.poses, cameras, landmarks, structure, sigma_px, _ROBUST_SCALE, Eliminated.empty(structure)
+    )
+    return information, gradient
+
+
 def without_first(measured: Measurements, states: States, landmarks: Float, prior: Prior | None, walk: Float) -> Prior:
     """Eliminate the first state of a window, with the landmarks that it sees.
 
@@ -261,6 +284,16 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
     pulled = gradient[kept] - _times(gain, gradient[leaving])
     information, pulled = _walked(information, pulled, walk)
     return Prior(states.of(np.arange(1, n)), 0.5 * (information + information.T), pulled)
+
+
+def first_window(prior: Prior) -> FirstWindow:
+    """Return what a prior says of poses, gravity, biases and the first velocity: of others it says nothing."""
+    n = len(prior.at.poses)
+    chosen = np.concatenate([np.arange(6 * n + 3), np.arange(9 * n, 9 * n + GRAVITY + BIASES)])
+    return FirstWindow(
+        prior.at.stamps_ns, prior.at.poses, prior.at.velocities[0], prior.at.gravity, prior.at.biases,
+        prior.information[np.ix_(chosen, chosen)], prior.gradient[chosen],
+    )  # fmt: skip
 
 
 def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Float]:

@@ -6,6 +6,7 @@ the scale. Until an `Initialiser` knows it there is no pose.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, Sighting, VisualResult
 from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import (
     Adjusted,
     Measurements,
@@ -29,6 +31,8 @@ from graphvio.monocular.adjustment import (
     adjust,
     covariance_of,
     first_prior,
+    first_window,
+    views_only,
     without_first,
 )
 from graphvio.monocular.initialiser import (
@@ -113,6 +117,8 @@ class MonocularEstimator:
         self._rate: Float | None = None
         self._solved: Solved | None = None
         self._final: list[tuple[int, Float]] = []
+        self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
+        self._first_pose_ns = 0  # of the epoch
 
     # ------------------------------------------------------------------ what is known
 
@@ -174,10 +180,26 @@ class MonocularEstimator:
         taken, self._final = self._final, []
         return taken
 
+    def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
+        """Hand over the views of each landmark once, when it leaves the window, or the window ends.
+
+        What is known from before an epoch's first pose comes as one.
+
+        Args:
+            on_views: called within `update` and `finish`.
+        """
+        self._on_views = on_views
+
     def finish(self) -> None:
         """Declare all poses of the window final."""
         if self._window is not None:
+            if self._on_views is not None:
+                while self._window.states.stamps_ns[0] < self._first_pose_ns:
+                    self._forget_first(self._window)
             states = self._window.states
+            if self._on_views is not None:
+                structure, places, _ = self._window.landmarks.structure(self._window.views, states.poses, self._cameras)
+                self._hand_over(structure, states, places)
             self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
 
     # ------------------------------------------------------------------ one frameset
@@ -281,7 +303,7 @@ class MonocularEstimator:
 
     def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Begin with a window whose scale is known."""
-        self._window, self._is_keyframe, self._before = window, True, None
+        self._window, self._is_keyframe, self._before, self._first_pose_ns = window, True, None, stamp_ns
         self.initialisations += 1
         self._report(
             stamp_ns,
@@ -357,6 +379,9 @@ class MonocularEstimator:
         structure, places, ids = window.landmarks.structure(window.views, states.poses, self._cameras)
         leaving = np.isin(ids, window.views[0].landmark)
         measured = self._measured(window, structure.of(leaving))
+        is_before = int(states.stamps_ns[0]) < self._first_pose_ns
+        if not is_before:
+            self._hand_over(measured.structure, states, places[leaving])
         step_s = (states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9
         walks = np.repeat([self._imu.gyro_random_walk, self._imu.accel_random_walk], 3)
         window.prior = without_first(measured, states, places[leaving], window.prior, walks**2 * step_s)
@@ -365,6 +390,19 @@ class MonocularEstimator:
         del window.stationary[0]
         self._final.append((int(states.stamps_ns[0]), states.poses[0]))
         window.states = states.of(np.arange(1, len(states.poses)))
+        if is_before and window.states.stamps_ns[0] >= self._first_pose_ns and self._on_views is not None:
+            self._on_views(first_window(window.prior))
+
+    def _hand_over(self, structure: Structure, states: States, places: Float) -> None:
+        """Hand over the views of some landmarks (L, 3), which no window will use again."""
+        if self._on_views is None or not len(places):
+            return
+        information, gradient = views_only(self._cameras, structure, self._sigma_px, states, places)
+        kept = np.isin(np.arange(len(states.poses)), structure.state)
+        rows = np.repeat(kept, 6)
+        self._on_views(
+            WindowViews(states.stamps_ns[kept], states.poses[kept], information[np.ix_(rows, rows)], gradient[rows])
+        )
 
     def _measured(self, window: Window, structure: Structure) -> Measurements:
         samples = self._samples_of(window.states.stamps_ns)

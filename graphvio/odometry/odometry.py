@@ -27,6 +27,7 @@ from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
+from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
@@ -239,6 +240,16 @@ class Odometry:
             on_window: called within `process`.
         """
         self._calibration.on_full_window(on_window)
+
+    def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
+        """Register a function that gets the views of landmarks by a rig of single cameras only, each of them once.
+
+        Args:
+            on_views: called within `process` and `finish`, when landmarks leave the window; and once in an epoch with
+                what was known before its first pose.
+        """
+        if isinstance(self._estimator, MonocularEstimator):
+            self._estimator.on_views(on_views)
 
     def limit_corners(self, share: float) -> None:
         """Follow fewer corners from now on, where real time demands it; from the thread that calls `process`.

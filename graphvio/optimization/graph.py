@@ -17,9 +17,11 @@ from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
+from graphvio.optimization.first_windows import first_window_factor
 from graphvio.optimization.nodes import Nodes
 from graphvio.optimization.record import SessionRecord
 from graphvio.optimization.solver import Edge
+from graphvio.optimization.views import views_factor
 from graphvio.rig import Imu
 
 _START_TILT_RAD = 0.2
@@ -74,6 +76,7 @@ class SessionGraph:
             self._add_inertial(first, nodes, imu)
             own = self._add_own_motions(number, first, nodes) if calibrates else np.zeros(0, dtype=np.int64)
             self._add_motions(first, nodes, own)
+            self._add_views(first, nodes)
 
     def __len__(self) -> int:
         return int(self.firsts[-1])
@@ -126,6 +129,7 @@ class SessionGraph:
         params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
         has_motion = np.zeros(len(nodes.rows), dtype=bool)
         has_motion[np.searchsorted(nodes.rows, record.motions.row[nodes.motions])] = True
+        has_motion[np.searchsorted(nodes.rows, record.views.row)] = True
         for n in range(1, len(nodes.rows)):
             if epoch[n] != epoch[n - 1]:
                 continue
@@ -188,6 +192,18 @@ class SessionGraph:
             self.add(
                 gtsam.BetweenFactorPose3(reference, x(j), gtsam.Pose3(motion.reference_T_current), gaussian(covariance))
             )
+
+    def _add_views(self, first: int, nodes: Nodes) -> None:
+        """Add the views of landmarks by a rig of single cameras only, and what it knew before the first pose."""
+        views = nodes.record.views
+        self._kind = "views"
+        for number in range(len(views.begins) - 1):
+            rows, *cost = views.at(number)
+            self.add(views_factor([x(first + nodes.index_of_row(int(row))) for row in rows], *cost))
+        self._kind = "before"
+        for number in range(len(nodes.record.first_windows.begins) - 1):
+            rows, *known = nodes.record.first_windows.at(number)
+            self.add(first_window_factor(first + np.array([nodes.index_of_row(int(row)) for row in rows]), *known))
 
 
 def _initial_priors(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor]:

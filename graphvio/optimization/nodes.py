@@ -79,6 +79,9 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     latest = stamps[0]
     seen = np.zeros(len(stamps), dtype=bool)
     seen[motions.row] = True
+    if len(record.views.row):
+        wanted[record.views.row] = wanted[record.first_windows.row] = True
+        seen |= record.is_stationary  # of single cameras nothing else is known of a standstill
     for row in range(len(stamps)):
         due = row + 1 < len(stamps) and stamps[row + 1] - latest > interval_s * 1e9 and seen[row]
         if wanted[row] or due:
@@ -99,19 +102,22 @@ def _last_of_references(reference: Int, row: Int) -> Int:
 def spread(nodes: Nodes, nav_T_body: Float) -> Float:
     """Interpolate the poses (F, 4, 4) of all framesets from those (N, 4, 4) of the states.
 
-    The smoothed trajectory is kept between two states; its error at the second is distributed linearly in time.
+    The smoothed trajectory, of single cameras alone the online one, is kept between two states; its error at the second
+    is distributed linearly in time.
     """
     record, rows = nodes.record, nodes.rows
-    poses = np.empty_like(record.smoothed)
+    # Single cameras' smoothed poses are those of keyframes; between them the online ones are not of one estimate.
+    chain = record.online if len(record.views.row) else record.smoothed
+    poses = np.empty_like(chain)
     stamps = record.stamps_ns
     for n, row in enumerate(rows):
         poses[row] = nav_T_body[n]
         if n + 1 == len(rows) or record.epoch[row] != record.epoch[rows[n + 1]]:
             continue
         after = rows[n + 1]
-        since = se3_inverse(record.smoothed[row])
-        error = se3_log(se3_inverse(since @ record.smoothed[after]) @ se3_inverse(nav_T_body[n]) @ nav_T_body[n + 1])
+        since = se3_inverse(chain[row])
+        error = se3_log(se3_inverse(since @ chain[after]) @ se3_inverse(nav_T_body[n]) @ nav_T_body[n + 1])
         for k in range(row + 1, after):
             share = float(stamps[k] - stamps[row]) / float(stamps[after] - stamps[row])
-            poses[k] = nav_T_body[n] @ since @ record.smoothed[k] @ se3_exp(share * error)
+            poses[k] = nav_T_body[n] @ since @ chain[k] @ se3_exp(share * error)
     return poses

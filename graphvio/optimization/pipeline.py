@@ -111,6 +111,7 @@ class Stages:
 
     Raises:
         OptimizationError: if the folder cannot be used.
+        RigError: if a rig of single cameras only is to be calibrated.
     """
 
     def __init__(
@@ -123,6 +124,8 @@ class Stages:
         calibrates: bool = False,
         on_progress: Progress | None = None,
     ) -> None:
+        for session in sessions if calibrates else ():
+            session.source.rig.need_pairs("the calibration of a session")
         self._sessions = sessions
         self._calibrates = calibrates
         self._config = config
@@ -175,6 +178,7 @@ class Stages:
             listener = RunListener(
                 on_step=recorder.add,
                 on_smoothed=recorder.add_smoothed,
+                on_views=recorder.add_views,
                 on_progress=lambda progress: self._on_progress(stage, progress.framesets, progress.total),
             )
             # All motions of a session must be measured with one calibration, that of the rig file.

@@ -15,7 +15,10 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import OptimizationError
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.odometry.step import NewKeyframe, Step
+from graphvio.optimization.first_windows import FirstWindows
+from graphvio.optimization.views import Views
 
 _NO_STAMP = -(2**62) - 1  # no measurement has it
 
@@ -76,6 +79,8 @@ class SessionRecord:
         own: motions of body over whole keyframes, measured by single pairs.
         own_pair: the pair of each of these.
         inertial: IMU samples.
+        views: of landmarks, by a rig of single cameras only.
+        first_windows: what such a rig knew before the first pose of each epoch.
     """
 
     name: str
@@ -97,6 +102,8 @@ class SessionRecord:
     own: Motions
     own_pair: Int
     inertial: Inertial
+    views: Views
+    first_windows: FirstWindows
 
     def to_bytes(self) -> bytes:
         """Return the record as a numpy archive; equal records give equal bytes."""
@@ -122,12 +129,16 @@ class SessionRecord:
             with np.load(path, allow_pickle=False) as file:
                 columns = {name: file[name] for name in file.files}
             groups = {
-                kind: cls(*(columns.pop(f"{kind}.{name}") for name in cls._fields))
-                for kind, cls in (("motions", Motions), ("own", Motions), ("inertial", Inertial))
+                kind: cls(*(columns.pop(f"{kind}.{name}") for name in cls._fields)) for kind, cls in _GROUPS.items()
             }
             return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
             raise OptimizationError(f"{path}: is no record of a session ({error}); remove the file") from None
+
+
+_GROUPS: dict[str, Any] = {
+    "motions": Motions, "own": Motions, "inertial": Inertial, "views": Views, "first_windows": FirstWindows
+}  # fmt: skip
 
 
 class Recorder:
@@ -143,6 +154,7 @@ class Recorder:
         self._since: list[tuple[Float, Float]] = []  # IMU since the last step with a pose
         self._is_covered = True
         self._smoothed: dict[int, Float] = {}
+        self._views: list[WindowViews | FirstWindow] = []
         self._used_at = 0  # row of the last step whose motion was used
 
     def add(self, step: Step) -> None:
@@ -184,6 +196,10 @@ class Recorder:
         """Add stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window."""
         self._smoothed.update(poses)
 
+    def add_views(self, views: WindowViews | FirstWindow) -> None:
+        """Add views of landmarks, as `graphvio.Odometry.on_views` hands them over."""
+        self._views.append(views)
+
     def record(self) -> SessionRecord:
         """Return all that was added as a record.
 
@@ -219,6 +235,8 @@ class Recorder:
             own=_joined([motion for _, motion in self._own if _is_known(motion, row_of)], row_of),
             own_pair=np.array([j for j, motion in self._own if _is_known(motion, row_of)], dtype=np.int64),
             inertial=_joined_inertial(rows),
+            views=Views.of([each for each in self._views if isinstance(each, WindowViews)], row_of),
+            first_windows=FirstWindows.of([each for each in self._views if isinstance(each, FirstWindow)], row_of),
         )
 
     def _add_inertial(self, step: Step) -> None:

@@ -1,0 +1,134 @@
+"""What is known of an epoch's first states from before its first pose, as a factor of a session's graph.
+
+Single cameras have no pose until the scale is known. What images and IMU showed until then is a quadratic cost of the
+first poses, and of velocity, gravity and biases. The frame in which it was found says nothing: it becomes a cost of the
+poses relative to the first of them, and of velocity and gravity as seen in body there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.backend.factors import b, v, x
+from graphvio.geometry import se3_adjoint, se3_compose, se3_inverse, se3_log, skew
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.measurements.window_views import FirstWindow
+from graphvio.optimization.views import root_of
+
+_OTHERS = 12  # velocity, gravity, biases
+_GRAVITY_NAV = np.array([0.0, 0.0, -GRAVITY_M_S2])
+
+
+class FirstWindows(NamedTuple):
+    """V costs; the states of cost i are rows ``begins[i]`` to ``begins[i + 1]`` of ``row`` and ``poses``."""
+
+    begins: Int  # (V + 1,)
+    row: Int  # (S,) rows of the framesets
+    poses: Float  # (S, 4, 4) ``nav_T_body`` at which the cost was linearised
+    others: Float  # (V, 12) velocity (m/s) and gravity (m/s^2) in body at the first, biases of gyro and accelerometer
+    gradient: Float  # one after the other, 6 K + 6 numbers of a cost of K states
+    information: Float  # one after the other, (6 K + 6)^2 numbers
+
+    def at(self, number: int) -> tuple[Int, Float, Float, Float, Float]:
+        """Return rows (K,), poses, the other values (12,), information and gradient of relative poses and others."""
+        states = slice(int(self.begins[number]), int(self.begins[number + 1]))
+        sizes = 6 * np.diff(self.begins) + 6
+        size, begin, begin2 = int(sizes[number]), int(sizes[:number].sum()), int((sizes[:number] ** 2).sum())
+        return (
+            self.row[states],
+            self.poses[states],
+            self.others[number],
+            self.information[begin2 : begin2 + size**2].reshape(size, size),
+            self.gradient[begin : begin + size],
+        )
+
+    @staticmethod
+    def of(given: Iterable[FirstWindow], row_of: Mapping[int, int]) -> FirstWindows:
+        """Collect costs, of those whose states all have a row."""
+        kept = [each for each in given if all(int(ns) in row_of for ns in each.stamps_ns)]
+        relative = [_relative(each) for each in kept]
+        return FirstWindows(
+            np.cumsum([0, *(len(each.stamps_ns) for each in kept)], dtype=np.int64),
+            np.array([row_of[int(ns)] for each in kept for ns in each.stamps_ns], dtype=np.int64),
+            np.concatenate([np.zeros((0, 4, 4)), *(each.poses for each in kept)]),
+            np.array([others for others, _, _ in relative]).reshape(-1, _OTHERS),
+            np.concatenate([np.zeros(0), *(gradient for _, _, gradient in relative)]),
+            np.concatenate([np.zeros(0), *(information.ravel() for _, information, _ in relative)]),
+        )
+
+
+def _relative(start: FirstWindow) -> tuple[Float, Float, Float]:
+    """Return the other values (12,), information and gradient of relative poses and these, for any first pose."""
+    n = len(start.poses)
+    first_R_nav = start.poses[0, :3, :3].T
+    velocity, gravity = first_R_nav @ start.velocity, first_R_nav @ start.gravity
+    by_relative = np.eye(6 * n + _OTHERS)
+    for k in range(1, n):
+        pose_T_first = np.ascontiguousarray(se3_inverse(start.poses[k]) @ start.poses[0])
+        by_relative[6 * k : 6 * k + 6, :6] = se3_adjoint(pose_T_first)
+    for at, vector in ((6 * n, velocity), (6 * n + 3, gravity)):
+        by_relative[at : at + 3, at : at + 3] = first_R_nav.T
+        by_relative[at : at + 3, :3] = -first_R_nav.T @ skew(vector)
+    information = by_relative.T @ start.information @ by_relative
+    gradient = by_relative.T @ start.gradient
+    gain = np.linalg.solve(information[:6, :6], information[:6, 6:]).T
+    eliminated = information[6:, 6:] - gain @ information[:6, 6:]
+    others = np.concatenate([velocity, gravity, start.biases])
+    return others, 0.5 * (eliminated + eliminated.T), gradient[6:] - gain @ gradient[:6]
+
+
+def first_window_factor(
+    states: Int, poses: Float, others: Float, information: Float, gradient: Float
+) -> gtsam.CustomFactor:
+    """Return the factor between the poses of K states, and velocity and biases of the first.
+
+    Args:
+        states: (K,) of the graph.
+        poses: (K, 4, 4) at which the cost was linearised.
+        others: (12,) velocity and gravity in body at the first, and biases.
+        information: (6 K + 6, 6 K + 6).
+        gradient: (6 K + 6,).
+    """
+    root, offset = root_of(information, gradient)
+    keys = [*(x(int(k)) for k in states), v(int(states[0])), b(int(states[0]))]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), keys, _error(root, offset, poses, others))
+
+
+def _error(
+    root: Float, offset: Float, poses: Float, others: Float
+) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[Float] | None], Float]:
+    """Return the error ``root d + offset`` with its derivatives; d are changes of relative poses and other values."""
+    known = [se3_inverse(np.ascontiguousarray(se3_inverse(poses[0]) @ pose)) for pose in poses[1:]]
+    columns = [np.ascontiguousarray(root[:, 6 * k : 6 * k + 6]) for k in range(len(known))]
+    of_velocity, of_gravity, of_gyro, of_accel = np.split(root[:, 6 * len(known) :], 4, axis=1)
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
+        *of_poses, of_first, of_bias = factor.keys()
+        first, *following = (values.atPose3(key).matrix() for key in of_poses)
+        inverse = se3_inverse(first)
+        velocity, gravity = inverse[:3, :3] @ values.atVector(of_first), inverse[:3, :3] @ _GRAVITY_NAV
+        bias = values.atConstantBias(of_bias)
+        residual = offset + of_velocity @ (velocity - others[:3]) + of_gravity @ (gravity - others[3:6])
+        residual += of_gyro @ (bias.gyroscope() - others[6:9]) + of_accel @ (bias.accelerometer() - others[9:])
+        by_first = np.zeros((len(offset), 6))
+        for k, (pose, then_T_first) in enumerate(zip(following, known, strict=True)):
+            first_T_pose = se3_compose(inverse, pose)
+            change = se3_log(se3_compose(then_T_first, first_T_pose))
+            residual += columns[k] @ change
+            if derivatives is not None:
+                by_pose = columns[k] @ gtsam.Pose3.LogmapDerivative(change)
+                by_first -= by_pose @ se3_adjoint(se3_inverse(first_T_pose))
+                derivatives[k + 1] = np.asfortranarray(by_pose)
+        if derivatives is not None:
+            by_first[:, :3] += of_velocity @ skew(velocity) + of_gravity @ skew(gravity)
+            derivatives[0] = np.asfortranarray(by_first)
+            derivatives[-2] = np.asfortranarray(of_velocity @ inverse[:3, :3])
+            derivatives[-1] = np.asfortranarray(np.hstack([of_accel, of_gyro]))
+        return np.asarray(residual)
+
+    return error

@@ -1,0 +1,105 @@
+"""Views of landmarks by single cameras as factors between the poses of a session's graph.
+
+The odometry hands over the views of each landmark once, with the landmark eliminated: a quadratic cost of the poses
+from which it was seen. It is used as a cost of these poses relative to the first of them, which loop closures may move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.geometry import se3_adjoint, se3_compose, se3_inverse, se3_log
+from graphvio.measurements.window_views import WindowViews
+
+_MIN_SHARE = 1e-12  # of the largest eigenvalue: what is smaller is rounding
+_MIN_STATES = 2
+_MIN_DIAGONAL = 1e-12
+
+
+class Views(NamedTuple):
+    """V costs of poses; the states of cost i are rows ``begins[i]`` to ``begins[i + 1]`` of the other columns."""
+
+    begins: Int  # (V + 1,)
+    row: Int  # (S,) rows of the framesets
+    poses: Float  # (S, 4, 4) ``nav_T_body`` at which the cost was linearised
+    gradient: Float  # (S, 6)
+    information: Float  # one after the other, (6 K)^2 numbers of a cost of K states
+
+    def at(self, number: int) -> tuple[Int, Float, Float, Float]:
+        """Return rows (K,), poses (K, 4, 4), information (6 K, 6 K) and gradient (6 K,) of a cost."""
+        states = slice(int(self.begins[number]), int(self.begins[number + 1]))
+        sizes = (6 * np.diff(self.begins)) ** 2
+        begin, size = int(sizes[:number].sum()), int(sizes[number])
+        information = self.information[begin : begin + size].reshape(2 * [6 * (states.stop - states.start)])
+        return self.row[states], self.poses[states], information, self.gradient[states].ravel()
+
+    @staticmethod
+    def of(given: Iterable[WindowViews], row_of: Mapping[int, int]) -> Views:
+        """Collect costs; poses of framesets that have no row are eliminated."""
+        kept = [each.of(np.array([int(ns) in row_of for ns in each.stamps_ns])) for each in given]
+        kept = [each for each in kept if len(each.stamps_ns) >= _MIN_STATES]
+        return Views(
+            np.cumsum([0, *(len(each.stamps_ns) for each in kept)], dtype=np.int64),
+            np.array([row_of[int(ns)] for each in kept for ns in each.stamps_ns], dtype=np.int64),
+            np.concatenate([np.zeros((0, 4, 4)), *(each.poses for each in kept)]),
+            np.concatenate([np.zeros((0, 6)), *(each.gradient.reshape(-1, 6) for each in kept)]),
+            np.concatenate([np.zeros(0), *(each.information.ravel() for each in kept)]),
+        )
+
+
+def views_factor(keys: Sequence[int], poses: Float, information: Float, gradient: Float) -> gtsam.CustomFactor:
+    """Return the factor of a cost between the poses of K states.
+
+    Args:
+        keys: (K,) of the poses.
+        poses: (K, 4, 4) at which the cost was linearised.
+        information: (6 K, 6 K).
+        gradient: (6 K,).
+    """
+    root, offset = root_of(information[6:, 6:], gradient[6:])
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), list(keys), _error(root, offset, poses))
+
+
+def root_of(information: Float, gradient: Float) -> tuple[Float, Float]:
+    """Return A (M, N) and c (M,) with ``A^T A`` the information (N, N), and ``A^T c`` the gradient (N,).
+
+    Directions of which nothing is known are left out.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _MIN_DIAGONAL))  # units differ
+    values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+    known = values > _MIN_SHARE * values[-1]
+    sizes = np.sqrt(values[known])
+    root = sizes[:, None] * vectors[:, known].T / scale
+    return np.ascontiguousarray(root), (vectors[:, known].T @ (scale * gradient)) / sizes
+
+
+def _error(
+    root: Float, offset: Float, poses: Float
+) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[Float] | None], Float]:
+    """Return the error ``root d + offset`` with its derivatives; d are changes of the poses relative to the first."""
+    known = [se3_inverse(np.ascontiguousarray(se3_inverse(poses[0]) @ pose)) for pose in poses[1:]]
+    columns = [np.ascontiguousarray(root[:, 6 * k : 6 * k + 6]) for k in range(len(known))]
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
+        keys = factor.keys()
+        first, *others = (values.atPose3(key).matrix() for key in keys)
+        inverse, residual = se3_inverse(first), offset.copy()
+        by_first = np.zeros((len(offset), 6))
+        for k, (pose, then_T_first) in enumerate(zip(others, known, strict=True)):
+            first_T_pose = se3_compose(inverse, pose)
+            change = se3_log(se3_compose(then_T_first, first_T_pose))
+            residual += columns[k] @ change
+            if derivatives is not None:
+                by_pose = columns[k] @ gtsam.Pose3.LogmapDerivative(change)
+                by_first -= by_pose @ se3_adjoint(se3_inverse(first_T_pose))
+                derivatives[k + 1] = np.asfortranarray(by_pose)
+        if derivatives is not None:
+            derivatives[0] = np.asfortranarray(by_first)
+        return residual
+
+    return error
