@@ -13,17 +13,15 @@ from graphvio.arrays import Float
 from graphvio.backend.ekf.estimator import FilterEstimator
 from graphvio.backend.estimator import MeasurementUpdate, StateEstimator
 from graphvio.backend.inertial import NO_SAMPLES
-from graphvio.backend.initialisation import shows_standstill
 from graphvio.backend.propagation import Propagator
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
 from graphvio.frontend.images import ImageMask
-from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
-from graphvio.measurements.events import Event, EventKind
+from graphvio.measurements.events import Event
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
@@ -31,6 +29,7 @@ from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
+from graphvio.odometry.imu_of_framesets import ImuOfFramesets
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.step import Step
@@ -107,6 +106,7 @@ class Odometry:
         self._frontend = (VisualFrontend if rig.pairs else SinglesFrontend)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
         self._estimator: StateEstimator = _estimator_class(rig, self.config)(rig, self.config, self.report)
+        self._imu = ImuOfFramesets(rig, self.config, self._synchroniser, self._estimator, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
         self._calibration = OnlineCalibration(rig, self.config, self._frontend, self._synchroniser, self.report)
@@ -117,7 +117,6 @@ class Odometry:
         self._on_step: list[Callable[[Step], None]] = []
         self._on_finish: list[Callable[[], None]] = []
         self._events: deque[Event] = deque()  # appended to by any thread
-        self._first_ns: int | None = None
         self._keyframe_ns: int | None = None  # stamp of the newest frameset that motions are measured from
         self._finished = False
 
@@ -290,13 +289,13 @@ class Odometry:
     def _estimate(self, frameset: FrameSet) -> Estimate:
         """Predict the state, measure the motion, gate it, update, recalibrate, and publish (sections 3 and 5)."""
         self.stage_ms = {}
-        if self._must_wait_for_imu(frameset.stamp_ns):
+        if self._imu.is_awaited(frameset.stamp_ns):
             visual = self._frontend.process(frameset, self._estimator.motion_since)
             self.stage_ms.update(visual.stage_ms)
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
-        is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
+        is_stationary = visual.is_stationary and self._imu.shows_standstill(predicted.interval)
         applied = self._gate(visual, is_stationary)
         status = self._update(predicted, visual, applied)
         self._recalibrate(frameset.stamp_ns, visual, status)
@@ -309,17 +308,17 @@ class Odometry:
     def _predict(self, stamp_ns: int) -> _Predicted:
         """Predict the state at a frameset by the IMU, eq. (11) and (12), or initialise it there."""
         initialisations = self._estimator.initialisations
-        if self._must_initialise(stamp_ns):
+        if self._imu.begins(stamp_ns):
             self._estimator.initialise(stamp_ns, self._synchroniser.initial_interval(stamp_ns))
             return _Predicted(stamp_ns, True, None, initialisations)
-        interval = self._imu_interval(self._estimator.latest_ns, stamp_ns)
+        interval = self._imu.interval(self._estimator.latest_ns, stamp_ns)
         if self._estimator.predict(stamp_ns, interval):
             self._frontend.start_keyframe()
         return _Predicted(stamp_ns, False, interval, initialisations)
 
     def _track(self, frameset: FrameSet, predicted: _Predicted) -> VisualResult:
         """Track all pairs and measure the relative motion, eq. (1) to (4)."""
-        readout = self._readout_motion(frameset.stamp_ns)
+        readout = self._imu.readout_motion(frameset.stamp_ns)
         visual = self._frontend.process(frameset, self._estimator.motion_since, readout)
         if not predicted.is_initial:
             self._vision_events.update(frameset.stamp_ns, visual, self._frontend.misaligned)
@@ -402,56 +401,7 @@ class Odometry:
             on_step(step)
         return estimate
 
-    # ------------------------------------------------------------------ the IMU's part
-
-    def _must_wait_for_imu(self, stamp_ns: int) -> bool:
-        """Whether the IMU's first sample is still awaited, without which there is nothing to initialise from."""
-        if self._estimator.is_initialised:
-            return False
-        if self._first_ns is None:
-            self._first_ns = stamp_ns
-        longest_ns = self.config.timing.max_imu_start_wait_s * 1e9
-        return self._synchroniser.precedes_imu(stamp_ns) and stamp_ns - self._first_ns < longest_ns
-
-    def _must_initialise(self, stamp_ns: int) -> bool:
-        """Whether this is the first frameset, or an IMU has come after an initialisation without one."""
-        if self._estimator.has_imu:
-            return False
-        return not self._estimator.is_initialised or self._synchroniser.initial_interval(stamp_ns) is not None
-
-    def _imu_interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two framesets, or None where it does not cover them."""
-        if not self._estimator.has_imu:
-            return None
-        interval = self._synchroniser.interval(start_ns, end_ns)
-        if interval is None:
-            self.report(
-                end_ns,
-                EventKind.IMU_NOT_COVERING,
-                "no IMU samples since the frameset before: constant velocity instead",
-            )
-        return interval
-
-    def _readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
-        """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""
-        readout_ns = max(camera.readout_ns for camera in self.rig.cameras)
-        if not readout_ns or not self._estimator.has_imu:
-            return None
-        interval = self._synchroniser.interval(stamp_ns, stamp_ns + readout_ns)
-        if interval is None:
-            return None
-        if not self._estimator.has_pose:
-            return ReadoutMotion.accelerated(interval, np.zeros(3), np.zeros(3), np.zeros(3))  # only how it turns
-        state = self._estimator.state()
-        body_R_nav = state.nav_T_body[:3, :3].T
-        acceleration = interval.mean_force - state.accel_bias + body_R_nav @ state.gravity_nav
-        return ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
-
-    def _imu_shows_standstill(self, interval: ImuInterval | None) -> bool:
-        """Whether the IMU shows a standstill; without an IMU it does, where samples are missing it does not."""
-        if interval is None:
-            return not self._estimator.has_imu
-        return shows_standstill(interval, self.config.initialisation)
+    # ------------------------------------------------------------------ prediction
 
     @timed("update")
     def _restart_prediction(self, stamp_ns: int, status: Status) -> None:

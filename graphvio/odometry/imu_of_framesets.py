@@ -1,0 +1,92 @@
+"""The IMU around a frameset: whether it is awaited, the interval before, a standstill, the motion of a readout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from graphvio.backend.estimator import StateEstimator
+from graphvio.backend.initialisation import shows_standstill
+from graphvio.config import Config
+from graphvio.frontend.rolling_shutter import ReadoutMotion
+from graphvio.measurements.events import EventKind
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.rig import Rig
+
+
+class ImuOfFramesets:
+    """The samples of a synchroniser, as an odometry uses them at each frameset.
+
+    Args:
+        rig: Cameras and IMU.
+        config: Configuration of all stages.
+        synchroniser: Keeps the samples.
+        estimator: Of the state.
+        report: Takes stamp, kind and detail of an event.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        config: Config,
+        synchroniser: Synchroniser,
+        estimator: StateEstimator,
+        report: Callable[[int, str, str], None],
+    ) -> None:
+        self._timing = config.timing
+        self._initialisation = config.initialisation
+        self._synchroniser = synchroniser
+        self._estimator = estimator
+        self._report = report
+        self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
+        self._first_ns: int | None = None
+
+    def is_awaited(self, stamp_ns: int) -> bool:
+        """Whether the IMU's first sample is still awaited, without which there is nothing to initialise from."""
+        if self._estimator.is_initialised:
+            return False
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        longest_ns = self._timing.max_imu_start_wait_s * 1e9
+        return self._synchroniser.precedes_imu(stamp_ns) and stamp_ns - self._first_ns < longest_ns
+
+    def begins(self, stamp_ns: int) -> bool:
+        """Whether this is the first frameset, or an IMU has come after an initialisation without one."""
+        if self._estimator.has_imu:
+            return False
+        return not self._estimator.is_initialised or self._synchroniser.initial_interval(stamp_ns) is not None
+
+    def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
+        """Return the IMU between two framesets, or None where it does not cover them."""
+        if not self._estimator.has_imu:
+            return None
+        interval = self._synchroniser.interval(start_ns, end_ns)
+        if interval is None:
+            self._report(
+                end_ns,
+                EventKind.IMU_NOT_COVERING,
+                "no IMU samples since the frameset before: constant velocity instead",
+            )
+        return interval
+
+    def readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
+        """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""
+        if not self._readout_ns or not self._estimator.has_imu:
+            return None
+        interval = self._synchroniser.interval(stamp_ns, stamp_ns + self._readout_ns)
+        if interval is None:
+            return None
+        if not self._estimator.has_pose:
+            return ReadoutMotion.accelerated(interval, np.zeros(3), np.zeros(3), np.zeros(3))  # only how it turns
+        state = self._estimator.state()
+        body_R_nav = state.nav_T_body[:3, :3].T
+        acceleration = interval.mean_force - state.accel_bias + body_R_nav @ state.gravity_nav
+        return ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
+
+    def shows_standstill(self, interval: ImuInterval | None) -> bool:
+        """Whether the IMU shows a standstill; without an IMU it does, where samples are missing it does not."""
+        if interval is None:
+            return not self._estimator.has_imu
+        return shows_standstill(interval, self._initialisation)
