@@ -98,13 +98,14 @@ def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path],
 def _digest(scene: str, sources: tuple[Path, ...]) -> str:
     """Digest of all sources that determine the bytes of a recording: the simulator, and the modules that it imports."""
     package = Path(graphvio.__file__).parent
-    taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py", "sessions/euroc_layout.py")
+    taken = ("cameras.py", "geometry.py", "kernels.py", "rig_files/native.py", "sessions/euroc_layout.py")
     scenes = package / "simulation" / "scenes"
     others = {scenes / f"{name}.py" for name in SCENE_NAMES if name != scene}
     others.add(package / "simulation" / "calibration_error.py")  # of none of these recordings
     simulator = sorted(path for path in (package / "simulation").rglob("*.py") if path not in others)
     digest = hashlib.sha256()
-    for path in [*(package / name for name in taken), *simulator, *sources]:
+    rig = sorted((package / "rig").glob("*.py"))
+    for path in [*(package / name for name in taken), *rig, *simulator, *sources]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 
