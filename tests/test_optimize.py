@@ -18,17 +18,19 @@ from calibration_walks import recorded, walk_simulator, with_wrong_place
 from typer.testing import CliRunner, Result
 from undrawn import undrawn
 
-from graphvio import open_source
+from graphvio import Odometry, open_source
 from graphvio.arrays import Float
 from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.errors import MissingExtraError, OptimizationError
+from graphvio.evaluation import evaluate
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.measurements.sensors import ImuSample
 from graphvio.optimization.loops.closures import load_closures
 from graphvio.optimization.loops.database import FeatureDatabase
 from graphvio.optimization.optimize import optimize
 from graphvio.optimization.pipeline import DATABASE, Session, Stages, optimize_sessions
-from graphvio.optimization.record import SessionRecord
+from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -137,6 +139,34 @@ def test_optimize_one_camera_is_consistent(of_one_camera: Path, walk: Path, with
         error = se3_log(np.ascontiguousarray(se3_inverse(pose) @ nav_T_world @ true))
         squares.append(error @ np.linalg.solve(covariance, error))
     assert np.mean(squares) < 9.0
+
+
+def test_optimize_epochs_of_single_cameras(walk: Path) -> None:
+    """Without the IMU for half a second, the scale has to be found again; each epoch has a frame of its own."""
+    rig = open_source(walk).rig.with_only(["cam0", "cam2"]).without_pairs()
+    source, odometry, recorder = open_source(walk, rig), Odometry(rig, Config()), Recorder("walk")
+    odometry.subscribe(recorder.add)
+    odometry.on_views(recorder.add_views)
+    gap_ns = source.start_ns + 3_000_000_000, source.start_ns + 3_500_000_000
+    for measurement in source:
+        if not (isinstance(measurement, ImuSample) and gap_ns[0] < measurement.stamp_ns < gap_ns[1]):
+            odometry.process(measurement)
+            recorder.add_smoothed(odometry.take_smoothed())
+    odometry.finish()
+    recorder.add_smoothed(odometry.take_smoothed())
+    record = recorder.record()
+    found = optimize([record], [rig.imu], [], Config())
+    assert [each.epoch for each in found.fragments] == [0, 1]
+    assert list(found.frames) == [0, 1]
+    assert len(record.first_windows.begins) == 3
+    assert source.truth is not None
+    truth, _ = load_trajectory(source.truth).at(record.stamps_ns, 0.1)
+    for epoch in (0, 1):
+        rows = np.flatnonzero(record.epoch == epoch)
+        assert len(rows) > 30
+        moved, true = found.sessions[0].nav_T_body[rows], truth.nav_T_body[rows]
+        error = evaluate(Trajectory(record.stamps_ns[rows], moved), Trajectory(record.stamps_ns[rows], true))
+        assert error.ate_position_m.rmse < 0.006
 
 
 def test_optimize_one_camera_writes_points_on_true_surfaces(of_one_camera: Path, walk: Path) -> None:
