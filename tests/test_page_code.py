@@ -106,7 +106,7 @@ def test_python_is_in_blocks_of_its_own() -> None:
 
 @pytest.mark.usefixtures("without_plots")
 def test_calibration(tmp_path: Path) -> None:
-    recorded(tmp_path / "recording", 8.0)
+    recorded(tmp_path / "recording", 6.0)
     (tmp_path / "RECORDING").symlink_to("recording")
     truth = load_trajectory(tmp_path / "recording/mav0/state_groundtruth_estimate0/data.csv")
     for name, pair in zip(("FRONT.txt", "BACK.txt"), load_rig(tmp_path / "recording").pairs, strict=True):
@@ -125,9 +125,9 @@ def test_calibration(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_optimization(room_walk: Path, session: Path, tmp_path: Path) -> None:
+def test_optimization(session: Path, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    (tmp_path / "RECORDING").symlink_to(room_walk)
+    (tmp_path / "RECORDING").symlink_to(session / "walk")
     for name in ("MONDAY", "TUESDAY"):
         shutil.copy(session / "walk.mcap", tmp_path / f"{name}.mcap")
     run_commands("docs/how-to/optimization.md", tmp_path)
