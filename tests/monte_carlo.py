@@ -7,7 +7,7 @@ surfaces; the points are projected through the real lenses, and every image poin
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -349,6 +349,35 @@ FIRST, FRAMES, KEYFRAME = 2, 20, 5  # a pose is composed from the first frameset
 _ANY_MOTION = SmootherConfig(lag_s=10.0, motion_accel_sigma_m_s2=1e3, motion_angular_accel_sigma_rad_s2=1e3)
 
 
+@cache
+def chain_of_motions(
+    conditions: Conditions, config: MotionConfig, seed: int, number: int, new_tracks: bool
+) -> tuple[Float, list[RelativeMotion]]:
+    """True poses (N, 4, 4) of a part of the walk, and the motions of every frameset since its keyframe."""
+    rng, walk, last = np.random.default_rng([seed, number]), walk_through(conditions.scene), FIRST + FRAMES
+    poses, motions = sample_poses(walk, last, rng), list[RelativeMotion]()
+    for key in range(0, last, KEYFRAME):
+        to = min(key + KEYFRAME, last)
+        if new_tracks or key == 0:
+            tracks = sample_tracks(walk, list(poses[key : to + 1] if new_tracks else poses), conditions, rng)
+            current = see(tracks, poses[key], conditions, rng)
+        reference = current
+        for k in range(key + 1, to + 1):
+            current = see(tracks, poses[k], conditions, rng)
+            refined = solve(observe(tracks, reference, current), motion_between(poses[key], poses[k]), config, rng)
+            motions.append(
+                RelativeMotion(
+                    _stamp_ns(key), _stamp_ns(k), se3_inverse(refined.cur_T_ref), refined.covariance,
+                    refined.shared_covariance, int(refined.inlier.sum()),
+                )
+            )  # fmt: skip
+    return poses, motions
+
+
+def _stamp_ns(frameset: int) -> int:
+    return round(frameset * 1e9 / RATE_HZ)
+
+
 def run_smoothed(
     conditions: Conditions, config: MotionConfig, chains: int, seed: int, *, new_tracks: bool, split: bool = True
 ) -> Campaign:
@@ -363,34 +392,17 @@ def run_smoothed(
             the noise of a keyframe's images is in the motion to it and in the ones from it.
         split: whether the smoother gets the covariance that motions from one keyframe share.
     """
-    campaign = Campaign()
-    walk, last = walk_through(conditions.scene), FIRST + FRAMES
-    stamps_ns = [round(k * 1e9 / RATE_HZ) for k in range(last + 1)]
+    campaign, first_ns, last_ns = Campaign(), _stamp_ns(FIRST), _stamp_ns(FIRST + FRAMES)
     for number in range(chains):
-        rng = np.random.default_rng([seed, number])
-        poses = list(sample_poses(walk, last, rng))
+        poses, motions = chain_of_motions(conditions, config, seed, number, new_tracks)
         smoother = Smoother(_ANY_MOTION, None)
         start = RigState(poses[0], np.zeros(3), np.zeros(3), np.zeros(3))
         smoother.initialise(0, start, InitialUncertainty(1e-8 * np.eye(6), 1.0, 1.0))
-        for key in range(0, last, KEYFRAME):
-            to = min(key + KEYFRAME, last)
-            if new_tracks or key == 0:
-                tracks = sample_tracks(walk, poses[key : to + 1] if new_tracks else poses, conditions, rng)
-                current = see(tracks, poses[key], conditions, rng)
-            reference = current
-            for k in range(key + 1, to + 1):
-                current = see(tracks, poses[k], conditions, rng)
-                refined = solve(observe(tracks, reference, current), motion_between(poses[key], poses[k]), config, rng)
-                shared = refined.shared_covariance if split else np.zeros((6, 6))
-                smoother.extend(stamps_ns[k], None)
-                smoother.add_motion(
-                    RelativeMotion(
-                        stamps_ns[key], stamps_ns[k], se3_inverse(refined.cur_T_ref), refined.covariance, shared,
-                        int(refined.inlier.sum()),
-                    )
-                )  # fmt: skip
-                smoother.update({stamps_ns[k // KEYFRAME * KEYFRAME], stamps_ns[FIRST]})
-        estimate = motion_between(smoother.pose(stamps_ns[FIRST]), smoother.pose(stamps_ns[last]))
-        campaign.errors.append(error_of(estimate, motion_between(poses[FIRST], poses[last])))
-        campaign.covariances.append(smoother.covariance_since(stamps_ns[FIRST]))
+        for k, motion in enumerate(motions, start=1):
+            smoother.extend(motion.stamp_ns, None)
+            smoother.add_motion(motion if split else replace(motion, shared_covariance=np.zeros((6, 6))))
+            smoother.update({_stamp_ns(k // KEYFRAME * KEYFRAME), first_ns})
+        estimate = motion_between(smoother.pose(first_ns), smoother.pose(last_ns))
+        campaign.errors.append(error_of(estimate, motion_between(poses[FIRST], poses[-1])))
+        campaign.covariances.append(smoother.covariance_since(first_ns))
     return campaign
