@@ -497,6 +497,19 @@ def test_self_calibration_with_imu_finds_time_offset_and_cameras_in_body() -> No
     assert angle_deg(after) < 0.3 * angle_deg(before)
 
 
+def test_self_calibration_whose_steps_were_refused_does_not_claim_to_know_the_cameras_in_body() -> None:
+    # The clock's offset moves an end of the IMU's samples: in some of these, steps that lose an interval are refused.
+    components = [*CAMERAS, "cameras-in-body", "time-offset", "imu-noise"]
+    in_body, distances2 = slice(BODY, BODY + 3), []
+    for seed in range(6):
+        error = draw(default_rig(), CalibrationError.of_level(2, components), seed)
+        walk = Walk(error.true_rig, seed=seed)
+        found = calibrated(SelfCalibration(error.written_rig), walk, 3.0).estimate.posterior
+        off = found.mean[in_body] - true_difference(error.written_rig, error.true_rig)[in_body]
+        distances2.append(off @ np.linalg.solve(found.covariance[in_body, in_body], off))
+    assert max(distances2) < chi2.ppf(1.0 - 1e-4 / len(distances2), 3)
+
+
 def test_solve_late_clock_does_not_drop_intervals_that_the_samples_cover() -> None:
     # Samples end with the last keyframe, but the clock's offset would need later ones.
     rig = default_rig()

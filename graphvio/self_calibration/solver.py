@@ -22,6 +22,7 @@ _CONVERGED = 0.05  # standard deviations of the prior
 _LOOSE_POSE_SIGMAS = np.repeat([np.deg2rad(5.0), 0.3], 3)  # keeps poses that no track constrains
 _LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
 _FIXED = 1e-9
+_FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
 _GRAVITY_NORM_SIGMA = 5e-3
 
 
@@ -107,8 +108,8 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
     first = states
     found = Eliminated.empty(window.tracks)
     sigmas = np.sqrt(np.diag(prior.covariance))
-    damping = 1e-6
-    at = _linearise(window, states, first, nominal, difference, prior, damping, found)
+    damping = _FIRST_DAMPING
+    at, damping_at = _linearise(window, states, first, nominal, difference, prior, damping, found), damping
     calibration = slice(6 * len(states.poses), 6 * len(states.poses) + len(difference))
     for _ in range(_MAX_STEPS):
         damped = at.hessian + damping * np.diag(np.diag(at.hessian))
@@ -117,15 +118,18 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         changed = difference + step[calibration]
         kept = found
         found = Eliminated.empty(window.tracks)
-        damping = max(0.1 * damping, 1e-9)
+        damping = max(0.1 * damping, _MIN_DAMPING)
         new = _linearise(window, moved, first, nominal, changed, prior, damping, found)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:
-            states, difference, at = moved, changed, new
+            states, difference, at, damping_at = moved, changed, new, damping
             if np.abs(step[calibration] / sigmas).max() < _CONVERGED:
                 break
         else:
             found, damping = kept, max(100.0 * damping, 1e-4)
+    if damping_at > _MIN_DAMPING:  # damped landmarks hold the cameras, as if their attitude in body were known
+        found = Eliminated.empty(window.tracks)
+        at = _linearise(window, states, first, nominal, difference, prior, _MIN_DAMPING, found)
     posterior = Gaussian(difference, _marginal(at.hessian, calibration))
     return Solution(states, posterior, at.errors2, at.imu_errors2, at.hessian)
 
