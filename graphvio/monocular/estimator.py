@@ -46,11 +46,11 @@ from graphvio.monocular.initialiser import (
 )
 from graphvio.monocular.overlap_trust import OverlapTrust, alone
 from graphvio.monocular.points import Solved, covariance_since, located_points
+from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
 from graphvio.monocular.structure import Cameras, Structure, located
 from graphvio.rig import Rig
 from graphvio.self_calibration.inertial import InertialSamples
-from graphvio.self_calibration.preintegration import covering_samples, preintegrate
 
 _FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
@@ -63,7 +63,6 @@ _MIN_FITTING = 0.3  # share of the landmarks
 _MAX_CONTRADICTION_NS = 1_000_000_000
 _MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
-_MARGIN_NS = 100_000_000
 _REPORT_AFTER_NS = 5_000_000_000
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
 _NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
@@ -91,14 +90,10 @@ class MonocularEstimator:
             np.array([single.left.body_T_cam for single in rig.singles]),
             np.array([single.left.focal_px for single in rig.singles]),
         )
-        self._stamps: list[int] = []  # of the IMU's samples, on the framesets' clock
-        self._readings: list[Float] = []
-        self._samples: tuple[Int, Float] = (np.zeros(0, dtype=np.int64), np.zeros((0, 6)))  # of the step before
-        self._noise = config.smoother.imu_noise_scale * np.array(
-            [rig.imu.gyro_noise_density, rig.imu.accel_noise_density]
+        self._samples = SampleBuffer(
+            rig.imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6)
         )
         self._has_imu = self._is_initialised = False
-        self._max_gap_ns = round(config.timing.max_imu_gap_ms * 1e6)
         self._sigma_px = _FIRST_SIGMA_PX
         self._initialiser = self._new_initialiser()
         self._trust = OverlapTrust(self._new_initialiser())
@@ -206,8 +201,7 @@ class MonocularEstimator:
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
         """Take an IMU sample (6,), stamped on the framesets' clock."""
-        self._stamps.append(stamp_ns)
-        self._readings.append(values)
+        self._samples.add(stamp_ns, values)
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Begin to collect keyframes."""
@@ -226,9 +220,9 @@ class MonocularEstimator:
         self.gate_results = {}
         self._rate = None
         window, before_ns = self._window, self._latest_ns
-        self._collect_samples(stamp_ns)
-        is_covered = self._covers(before_ns, stamp_ns)
-        is_late = not is_covered and not (self._samples[0][-1:] >= stamp_ns).any()
+        self._samples.collect(self._oldest_needed_ns(stamp_ns), stamp_ns)
+        is_covered = self._samples.covers(before_ns, stamp_ns)
+        is_late = not is_covered and not self._samples.reaches(stamp_ns)
         self._awaits_imu = is_late and window is not None and stamp_ns - before_ns < _MAX_AWAITED_NS
         if self._awaits_imu:
             return False
@@ -239,7 +233,7 @@ class MonocularEstimator:
         if window is None:
             return False
         states = window.states
-        step = preintegrate(*self._samples, before_ns, stamp_ns, states.parameters, self._noise, self._max_gap_ns)
+        step = self._samples.preintegrated(before_ns, stamp_ns, states.parameters)
         pose, velocity, dt = states.poses[-1], states.velocities[-1], step.duration_s
         moved = pose[:3, 3] + dt * velocity + 0.5 * dt**2 * states.gravity + pose[:3, :3] @ step.position
         if interval is not None:
@@ -405,7 +399,7 @@ class MonocularEstimator:
         )
 
     def _measured(self, window: Window, structure: Structure) -> Measurements:
-        samples = self._samples_of(window.states.stamps_ns)
+        samples = self._samples.between(window.states.stamps_ns)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
 
     def _set_covariance(self, adjusted: Adjusted) -> None:
@@ -460,36 +454,16 @@ class MonocularEstimator:
         self._since_ns, self._is_reported = stamp_ns, False
 
     def _new_initialiser(self) -> Initialiser:
-        return Initialiser(self._cameras, self._samples_of, _FIRST_SIGMA_PX)
+        return Initialiser(self._cameras, self._samples.between, _FIRST_SIGMA_PX)
 
-    def _collect_samples(self, until_ns: int) -> None:
-        """Add the samples that have come to those before, up to the first one after a stamp; forget what is not needed.
-
-        Later ones would change the integration next to the stamp, and results would depend on when they came.
-        """
-        stamps, readings = self._samples
-        if self._stamps:
-            stamps = np.concatenate([stamps, self._stamps])
-            readings = np.concatenate([readings, self._readings])
-            self._stamps, self._readings = [], []
-            order = np.argsort(stamps, kind="stable")  # a corrected time offset may have moved the newest ones
-            stamps, readings = stamps[order], readings[order]
+    def _oldest_needed_ns(self, stamp_ns: int) -> int:
+        """Return the stamp from which on IMU samples are needed at a frameset."""
         oldest_ns = self._latest_ns if self._window is None else int(self._window.states.stamps_ns[0])
         if self._window is None and self._initialiser.oldest_ns is not None:
             oldest_ns = self._initialiser.oldest_ns
         if self._trust.oldest_ns is not None:
-            oldest_ns = min(oldest_ns, max(self._trust.oldest_ns, until_ns - MAX_DURATION_NS))
-        first = max(int(np.searchsorted(stamps, oldest_ns - _MARGIN_NS)) - 1, 0)
-        end = int(np.searchsorted(stamps, until_ns)) + 1
-        self._stamps, self._readings = stamps[end:].tolist(), list(readings[end:])
-        self._samples = stamps[first:end], readings[first:end]
-
-    def _samples_of(self, stamps_ns: Int) -> InertialSamples:
-        """Return the IMU over some states."""
-        return InertialSamples(*self._samples, stamps_ns, self._noise, self._max_gap_ns)
-
-    def _covers(self, start_ns: int, end_ns: int) -> bool:
-        return bool(covering_samples(self._samples[0], start_ns, end_ns, 0.0, self._max_gap_ns)[1] >= 0)
+            oldest_ns = min(oldest_ns, max(self._trust.oldest_ns, stamp_ns - MAX_DURATION_NS))
+        return oldest_ns
 
 
 def adjust_no_keyframes(rig: Rig) -> None:

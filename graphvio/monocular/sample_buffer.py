@@ -1,0 +1,72 @@
+"""IMU samples of the estimator's window, in time order, as far as the newest state needs them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.rig import Imu
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.preintegration import Preintegrated, covering_samples, preintegrate
+
+_MARGIN_NS = 100_000_000
+
+
+class SampleBuffer:
+    """Keeps the samples between the oldest state that is of use and the newest one.
+
+    Args:
+        imu: Of the rig.
+        noise_scale: Factor on its stated white noise.
+        max_gap_ns: Between samples of one interval.
+    """
+
+    def __init__(self, imu: Imu, noise_scale: float, max_gap_ns: int) -> None:
+        self._noise = noise_scale * np.array([imu.gyro_noise_density, imu.accel_noise_density])
+        self._max_gap_ns = max_gap_ns
+        self._waiting_ns: list[int] = []
+        self._waiting: list[Float] = []
+        self._stamps_ns, self._readings = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+
+    def add(self, stamp_ns: int, values: Float) -> None:
+        """Take a sample (6,), gyro in rad/s and accelerometer in m/s^2, stamped on the framesets' clock."""
+        self._waiting_ns.append(stamp_ns)
+        self._waiting.append(values)
+
+    def collect(self, oldest_ns: int, until_ns: int) -> None:
+        """Use the samples that have come, up to the first one after a stamp; forget those from before another one.
+
+        Later ones would change the integration next to the stamp, and results would depend on when they came.
+        """
+        stamps, readings = self._stamps_ns, self._readings
+        if self._waiting_ns:
+            stamps = np.concatenate([stamps, self._waiting_ns])
+            readings = np.concatenate([readings, self._waiting])
+            order = np.argsort(stamps, kind="stable")  # a corrected time offset may have moved the newest ones
+            stamps, readings = stamps[order], readings[order]
+        first = max(int(np.searchsorted(stamps, oldest_ns - _MARGIN_NS)) - 1, 0)
+        end = int(np.searchsorted(stamps, until_ns)) + 1
+        self._waiting_ns, self._waiting = stamps[end:].tolist(), list(readings[end:])
+        self._stamps_ns, self._readings = stamps[first:end], readings[first:end]
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Return whether a sample in use is as late as a stamp, or later."""
+        return bool((self._stamps_ns[-1:] >= stamp_ns).any())
+
+    def covers(self, start_ns: int, end_ns: int) -> bool:
+        """Return whether the samples in use have no gap between two stamps."""
+        return bool(covering_samples(self._stamps_ns, start_ns, end_ns, 0.0, self._max_gap_ns)[1] >= 0)
+
+    def preintegrated(self, start_ns: int, end_ns: int, parameters: Float) -> Preintegrated:
+        """Integrate the samples in use between two stamps, by the IMU's parameters (25,).
+
+        Raises:
+            MeasurementError: If they do not cover it.
+        """
+        return preintegrate(
+            self._stamps_ns, self._readings, start_ns, end_ns, parameters, self._noise, self._max_gap_ns
+        )
+
+    def between(self, stamps_ns: Int) -> InertialSamples:
+        """Return the samples in use, for the intervals between the stamps (K,) of states."""
+        return InertialSamples(self._stamps_ns, self._readings, stamps_ns, self._noise, self._max_gap_ns)
