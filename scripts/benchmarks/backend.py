@@ -21,7 +21,7 @@ from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine
 from graphvio.arrays import Float
-from graphvio.backend.factors import r, x
+from graphvio.backend.factors import g, r, x
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
@@ -147,6 +147,7 @@ class _Incremental:
         new = list(added.values.keys())
         self._known |= set(new)
         kept = [key for k in references for key in (x(k), r(k)) if key in self._known]
+        kept += [g()] if g() in self._known else []  # gravity's direction, one for all states
         stamps = dict.fromkeys([*new, *kept], now_s)
         start = perf_counter()
         self._smoother.update(added.factors, added.values, stamps)  # type: ignore[arg-type]

@@ -114,7 +114,7 @@ class FactorLog:
         self._added.factors.push_back(factor)
         for key in new:
             kind = chr(gtsam.Symbol(key).chr())
-            if kind == "v":
+            if kind in "vg":
                 self._added.values.insert(key, values.atVector(key))
             elif kind == "b":
                 self._added.values.insert(key, values.atConstantBias(key))
