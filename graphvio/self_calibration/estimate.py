@@ -22,12 +22,12 @@ class CalibrationEstimate:
     Attributes:
         file_rig: the rig of the file.
         posterior: of the difference from it (see `graphvio.self_calibration.parameters`), if no part is exact.
-        difference: (C,) that is in force, with zero for what is exact and does not change with heat.
+        difference: (C,) that is in force, with zero for what is exact.
         file_factors: (G,) by which factors the file's errors exceed their standard deviations: of cameras and left
             to right, and of the places of pairs and the IMU. `EXACT` where the file is as good as exact.
         log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is very
             strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
-        is_knocked: whether a knock has changed the cameras since the run began.
+        is_changed: whether a knock has changed the cameras since the file was made.
     """
 
     file_rig: Rig
@@ -35,12 +35,12 @@ class CalibrationEstimate:
     difference: Float
     file_factors: Float
     log_bayes_factor: float = 0.0
-    is_knocked: bool = False
+    is_changed: bool = False
 
     @property
     def is_file_exact(self) -> bool:
-        """Whether the measurements say nothing against the rig file, but for what heat changes."""
-        return not self.is_knocked and bool((self.file_factors == EXACT).all())
+        """Whether the measurements say nothing against the rig file, which then stays in force."""
+        return not self.is_changed and bool((self.file_factors == EXACT).all())
 
     @cached_property
     def sigmas(self) -> Float:
@@ -50,7 +50,7 @@ class CalibrationEstimate:
     @cached_property
     def rig(self) -> Rig:
         """The rig with the calibration that is in force."""
-        if not self.difference.any():
+        if self.is_file_exact:
             return self.file_rig
         moved = RigCalibration.of(self.file_rig).moved(self.difference[: self._n_of_pairs])
         rig = moved.applied_to(self.file_rig)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Float, Int
 from graphvio.linear_algebra import cholesky, solve_lower
 
 EXACT = 1e-3
@@ -49,7 +49,7 @@ class FilePrior(NamedTuple):
     Attributes:
         covariance: (C, C) of the differences from the file, for factors of 1.
         group: (C,) index of the factor of each parameter, or -1 where none applies: no file has biases.
-        change: (C, C) covariance of what has changed since the run began, or None. No factor applies to it.
+        change: (C, C) covariance of what knocks have changed since the file was made, or None. No factor applies to it.
     """
 
     covariance: Float
@@ -70,11 +70,6 @@ class FilePrior(NamedTuple):
     def changed(self, change: Float) -> FilePrior:
         """Return the prior after a change with a covariance (C, C)."""
         return self._replace(change=change if self.change is None else self.change + change)
-
-    def is_fixed(self, factors: Float) -> Bool:
-        """Return which parameters (C,) are as in an exact file, and have not changed since, for the groups' factors."""
-        exact = self.of_each(factors) == EXACT
-        return np.asarray(exact if self.change is None else exact & (np.diag(self.change) == 0.0))
 
     def of_each(self, factors: Float) -> Float:
         """Return each parameter's factor (C,), of the groups' factors (G,)."""

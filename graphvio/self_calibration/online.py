@@ -27,7 +27,7 @@ from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
-from graphvio.self_calibration.prior import CAMERAS, extrinsic_covariances, file_prior, walk_per_second
+from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe, View, median_displacement_px
 
@@ -120,8 +120,6 @@ class SelfCalibration:
         widest = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
         self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(widest)))
         self._walk = walk_per_second(rig, self._prior, WALK)
-        of_cameras = self._prior.group == CAMERAS
-        self._heat = np.where(np.outer(of_cameras, of_cameras), self._walk, 0.0)  # where nothing moves, this does
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         n_groups = self._prior.n_groups
         posterior = self._evidence.given(self._prior, np.ones(n_groups))
@@ -232,10 +230,9 @@ class SelfCalibration:
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         self._consider.extend(adjusted.window, adjusted.by_cameras)
         self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
-        has_changed = not np.array_equal(adjusted.estimate.difference, self.estimate.difference)
         self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
         self._in_force = self._nominal.moved(self.estimate.difference[: self._n_cameras])
-        return has_changed
+        return not (was_exact and self.estimate.is_file_exact)
 
     @property
     def is_trusted(self) -> bool:
@@ -305,7 +302,6 @@ class SelfCalibration:
             self._keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
-            self._prior = self._prior.changed(duration_s * self._heat)
         prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
         samples, difference = self._samples_of(window), self.estimate.posterior.mean
         if is_full:
@@ -326,11 +322,13 @@ class SelfCalibration:
         evidence = self._evidence.with_window(prior, solution.calibration)
         factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
         posterior = evidence.given(self._prior, _assumed(factors))
-        in_force = np.where(self._prior.is_fixed(factors), 0.0, evidence.given(self._prior, factors).mean)
-        n_cameras, is_knocked = self._n_cameras, self.restarts > 0
+        n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
+        is_changed = self._prior.change is not None
+        if is_changed or (factors != EXACT).any():
+            in_force = evidence.given(self._prior, factors).mean
         covariance = evidence.mean_square(self._prior, in_force)[:n_cameras, :n_cameras]
         extrinsics = {}
-        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_knocked)
+        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
             extrinsics = extrinsic_covariances(self._rig, anywhere)

@@ -34,8 +34,7 @@ _GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.05, 0.3
 _BIAS_WALK_FACTOR = 2.0  # on the stated random walks, which are those of a sensor at one temperature
 
 
-CAMERAS, PLACES, _NO_GROUP = 0, 1, -1
-"""Groups of parameters whose errors have a common factor: lenses and left to right; places of pairs, and the IMU."""
+_CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
 
 
 def file_prior(rig: Rig) -> FilePrior:
@@ -45,14 +44,14 @@ def file_prior(rig: Rig) -> FilePrior:
     """
     of_pairs = _covariance_of_pairs(rig)
     n = len(of_pairs)
-    group = np.full(n, CAMERAS)
-    group.reshape(-1, PAIR)[:, BODY:] = PLACES
+    group = np.full(n, _CAMERAS)
+    group.reshape(-1, PAIR)[:, BODY:] = _PLACES
     if rig.imu is None:
         return FilePrior(of_pairs, group)
     covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
     covariance[:n, :n] = of_pairs
     covariance[n:, n:] = np.diag(_sigmas_of_imu(rig.calibration_sigmas) ** 2)
-    of_imu = np.full(PARAMETERS, PLACES)
+    of_imu = np.full(PARAMETERS, _PLACES)
     of_imu[:GYRO_MATRIX] = _NO_GROUP
     return FilePrior(covariance, np.concatenate([group, of_imu]))
 
