@@ -15,10 +15,10 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.factors import b, v, x
-from graphvio.geometry import se3_adjoint, se3_compose, se3_inverse, se3_log, skew
+from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.measurements.window_views import FirstWindow
-from graphvio.optimization.views import root_of
+from graphvio.optimization.views import RelativePoses, root_of
 
 _OTHERS = 12  # velocity, gravity, biases
 _GRAVITY_NAV = np.array([0.0, 0.0, -GRAVITY_M_S2])
@@ -103,27 +103,18 @@ def _error(
     root: Float, offset: Float, poses: Float, others: Float
 ) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[Float] | None], Float]:
     """Return the error ``root d + offset`` with its derivatives; d are changes of relative poses and other values."""
-    known = [se3_inverse(np.ascontiguousarray(se3_inverse(poses[0]) @ pose)) for pose in poses[1:]]
-    columns = [np.ascontiguousarray(root[:, 6 * k : 6 * k + 6]) for k in range(len(known))]
-    of_velocity, of_gravity, of_gyro, of_accel = np.split(root[:, 6 * len(known) :], 4, axis=1)
+    relative = RelativePoses(root, poses)
+    of_velocity, of_gravity, of_gyro, of_accel = np.split(root[:, 6 * (len(poses) - 1) :], 4, axis=1)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
         *of_poses, of_first, of_bias = factor.keys()
-        first, *following = (values.atPose3(key).matrix() for key in of_poses)
-        inverse = se3_inverse(first)
+        now = [values.atPose3(key).matrix() for key in of_poses]
+        inverse = se3_inverse(now[0])
         velocity, gravity = inverse[:3, :3] @ values.atVector(of_first), inverse[:3, :3] @ _GRAVITY_NAV
         bias = values.atConstantBias(of_bias)
         residual = offset + of_velocity @ (velocity - others[:3]) + of_gravity @ (gravity - others[3:6])
         residual += of_gyro @ (bias.gyroscope() - others[6:9]) + of_accel @ (bias.accelerometer() - others[9:])
-        by_first = np.zeros((len(offset), 6))
-        for k, (pose, then_T_first) in enumerate(zip(following, known, strict=True)):
-            first_T_pose = se3_compose(inverse, pose)
-            change = se3_log(se3_compose(then_T_first, first_T_pose))
-            residual += columns[k] @ change
-            if derivatives is not None:
-                by_pose = columns[k] @ gtsam.Pose3.LogmapDerivative(change)
-                by_first -= by_pose @ se3_adjoint(se3_inverse(first_T_pose))
-                derivatives[k + 1] = np.asfortranarray(by_pose)
+        by_first = relative.add_to(residual, now, derivatives)
         if derivatives is not None:
             by_first[:, :3] += of_velocity @ skew(velocity) + of_gravity @ skew(gravity)
             derivatives[0] = np.asfortranarray(by_first)

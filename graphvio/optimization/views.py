@@ -78,26 +78,50 @@ def root_of(information: Float, gradient: Float) -> tuple[Float, Float]:
     return np.ascontiguousarray(root), (vectors[:, known].T @ (scale * gradient)) / sizes
 
 
+class RelativePoses:
+    """Changes of poses relative to the first of them, as columns of an error ``root d + offset``.
+
+    Args:
+        root: (M, N) whose first 6 (K - 1) columns are of these changes.
+        poses: (K, 4, 4) from which they count.
+    """
+
+    def __init__(self, root: Float, poses: Float) -> None:
+        self._known = [se3_inverse(np.ascontiguousarray(se3_inverse(poses[0]) @ pose)) for pose in poses[1:]]
+        self._columns = [np.ascontiguousarray(root[:, 6 * k : 6 * k + 6]) for k in range(len(self._known))]
+
+    def add_to(self, residual: Float, poses: Sequence[Float], derivatives: list[Float] | None) -> Float:
+        """Add the changes of K poses (4, 4) to a residual (M,).
+
+        Args:
+            residual: changed in place.
+            poses: ``nav_T_body`` as they are now.
+            derivatives: by each pose, of which all but the first are filled in; None where they are not needed.
+
+        Returns:
+            Derivative (M, 6) by the first pose; zero without derivatives.
+        """
+        inverse, by_first = se3_inverse(poses[0]), np.zeros((len(residual), 6))
+        for k, (pose, then_T_first) in enumerate(zip(poses[1:], self._known, strict=True)):
+            first_T_pose = se3_compose(inverse, pose)
+            change = se3_log(se3_compose(then_T_first, first_T_pose))
+            residual += self._columns[k] @ change
+            if derivatives is not None:
+                by_pose = self._columns[k] @ gtsam.Pose3.LogmapDerivative(change)
+                by_first -= by_pose @ se3_adjoint(se3_inverse(first_T_pose))
+                derivatives[k + 1] = np.asfortranarray(by_pose)
+        return by_first
+
+
 def _error(
     root: Float, offset: Float, poses: Float
 ) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[Float] | None], Float]:
     """Return the error ``root d + offset`` with its derivatives; d are changes of the poses relative to the first."""
-    known = [se3_inverse(np.ascontiguousarray(se3_inverse(poses[0]) @ pose)) for pose in poses[1:]]
-    columns = [np.ascontiguousarray(root[:, 6 * k : 6 * k + 6]) for k in range(len(known))]
+    relative = RelativePoses(root, poses)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
-        keys = factor.keys()
-        first, *others = (values.atPose3(key).matrix() for key in keys)
-        inverse, residual = se3_inverse(first), offset.copy()
-        by_first = np.zeros((len(offset), 6))
-        for k, (pose, then_T_first) in enumerate(zip(others, known, strict=True)):
-            first_T_pose = se3_compose(inverse, pose)
-            change = se3_log(se3_compose(then_T_first, first_T_pose))
-            residual += columns[k] @ change
-            if derivatives is not None:
-                by_pose = columns[k] @ gtsam.Pose3.LogmapDerivative(change)
-                by_first -= by_pose @ se3_adjoint(se3_inverse(first_T_pose))
-                derivatives[k + 1] = np.asfortranarray(by_pose)
+        keys, residual = factor.keys(), offset.copy()
+        by_first = relative.add_to(residual, [values.atPose3(key).matrix() for key in keys], derivatives)
         if derivatives is not None:
             derivatives[0] = np.asfortranarray(by_first)
         return residual
