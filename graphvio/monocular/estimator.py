@@ -27,14 +27,18 @@ from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import (
     Adjusted,
     Measurements,
+    Prior,
     States,
     adjust,
     covariance_of,
+    equations,
+    evidence_of,
     first_prior,
     first_window,
     views_only,
     without_first,
 )
+from graphvio.monocular.calibration import WindowCalibration, time_offset_s
 from graphvio.monocular.initialiser import (
     MAX_DURATION_NS,
     MAX_ERROR2,
@@ -50,13 +54,14 @@ from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
 from graphvio.monocular.structure import Cameras, Structure, located
 from graphvio.rig import Rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.inertial import InertialSamples
 
 _FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
 _NOISE_GAIN = 0.1  # of one keyframe
 _RAYLEIGH_MEDIAN = 1.1774
-_STEPS, _KEYFRAME_STEPS = 2, 3
+_STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
 _MAX_OFF = 0.3
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
@@ -64,6 +69,7 @@ _MAX_CONTRADICTION_NS = 1_000_000_000
 _MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
 _REPORT_AFTER_NS = 5_000_000_000
+_CALIBRATION_EVERY_NS = 1_000_000_000
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
 _NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
 
@@ -86,13 +92,14 @@ class MonocularEstimator:
         self._config = config
         self._imu = rig.imu
         self._report = report
-        self._cameras = Cameras(
-            np.array([single.left.body_T_cam for single in rig.singles]),
-            np.array([single.left.focal_px for single in rig.singles]),
-        )
+        self._cameras = Cameras.of(rig)
+        self._calibration = WindowCalibration(rig) if config.estimates_calibration else None
         self._samples = SampleBuffer(
             rig.imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6)
         )
+        self._shift_ns = 0  # of samples' stamps, for what the time offset was corrected by
+        self._calibration_estimate: CalibrationEstimate | None = None
+        self._calibration_ns = 0
         self._has_imu = self._is_initialised = False
         self._sigma_px = _FIRST_SIGMA_PX
         self._initialiser = self._new_initialiser()
@@ -131,6 +138,11 @@ class MonocularEstimator:
     def has_imu(self) -> bool:
         """Whether the IMU has come."""
         return self._has_imu
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """What is known of the calibration, updated once a second; None before the first pose, and where it is not."""
+        return self._calibration_estimate
 
     @property
     def latest_ns(self) -> int:
@@ -193,7 +205,8 @@ class MonocularEstimator:
                     self._forget_first(self._window)
             states = self._window.states
             if self._on_views is not None:
-                structure, places, _ = self._window.landmarks.structure(self._window.views, states.poses, self._cameras)
+                cameras = states.cameras(self._cameras)
+                structure, places, _ = self._window.landmarks.structure(self._window.views, states.poses, cameras)
                 self._hand_over(structure, states, places)
             self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
 
@@ -201,7 +214,11 @@ class MonocularEstimator:
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
         """Take an IMU sample (6,), stamped on the framesets' clock."""
-        self._samples.add(stamp_ns, values)
+        self._samples.add(stamp_ns + self._shift_ns, values)
+
+    def shift_samples(self, shift_ns: int) -> None:
+        """Take note that stamps of samples have a correction of the time offset from now on, which is a state here."""
+        self._shift_ns += shift_ns
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Begin to collect keyframes."""
@@ -298,6 +315,8 @@ class MonocularEstimator:
     def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Begin with a window whose scale is known."""
         self._window, self._is_keyframe, self._before, self._first_pose_ns = window, True, None, stamp_ns
+        if self._calibration is not None:
+            self._calibration.factors = window.factors
         self.initialisations += 1
         self._report(
             stamp_ns,
@@ -307,8 +326,12 @@ class MonocularEstimator:
         return self._solve(window, stamp_ns, is_keyframe, is_new=True)
 
     def _without_overlaps(self, stamp_ns: int, window: Window | None) -> Window | None:
-        """Return a window without overlaps where these cannot be trusted: they are not used from then on."""
-        if not (self._has_overlaps and self._are_trusted):
+        """Return a window without overlaps where these cannot be trusted: they are not used from then on.
+
+        Once the calibration is estimated, the window itself finds out how the cameras are turned to each other.
+        """
+        is_estimated = self._calibration is not None and not self._calibration.is_file_exact
+        if not (self._has_overlaps and self._are_trusted) or is_estimated:
             return None
         states = None if window is None else window.states
         found = self._trust.add(stamp_ns, self._sightings, self._is_stationary, states)
@@ -326,10 +349,17 @@ class MonocularEstimator:
             window.views.append(window.names.join(self._sightings))
             window.stationary.append(self._is_stationary)
         self._is_keyframe = is_keyframe
-        structure, places, ids = window.landmarks.structure(window.views, window.states.poses, self._cameras)
+        cameras = window.states.cameras(self._cameras)
+        structure, places, ids = window.landmarks.structure(window.views, window.states.poses, cameras)
         measured = self._measured(window, structure)
-        adjusted = adjust(measured, window.states, places, window.prior, _KEYFRAME_STEPS if is_keyframe else _STEPS)
+        steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
+        adjusted = adjust(measured, window.states, places, window.prior, steps, self._file)
+        if is_keyframe and self._doubts_file(measured, adjusted, window.prior):
+            adjusted = adjust(
+                measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS, self._file
+            )
         window.states = adjusted.states
+        self._samples.time_offset_s = time_offset_s(adjusted.states.calibration)
         window.landmarks.put(adjusted.landmarks)
         off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
         newest = window.views[-1]
@@ -344,9 +374,34 @@ class MonocularEstimator:
         self._solved = Solved(adjusted, structure, ids, window.views[-1])
         self._set_covariance(adjusted)
         if is_keyframe:
+            self._note_calibration(stamp_ns, adjusted.states)
             self._finish_keyframe(window, adjusted)
         status = self._status(stamp_ns, is_tracking, adjusted)
         return StateUpdate(status, outliers=dropped)
+
+    @property
+    def _file(self) -> Float | None:
+        """Information of the rig file on the calibration, None where that is taken for exact."""
+        return None if self._calibration is None else self._calibration.file(self._calibration.factors)
+
+    def _doubts_file(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
+        """Let the window say how wrong the rig file is, and return whether that is news."""
+        if self._calibration is None:
+            return False
+        file, at = self._file, adjusted.equations
+        if file is None:
+            file = np.zeros((self._calibration.size, self._calibration.size))
+            at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
+        return self._calibration.update(evidence_of(at, adjusted.states, file))
+
+    def _note_calibration(self, stamp_ns: int, states: States) -> None:
+        """Keep what is known of the calibration, once in a second."""
+        if self._calibration is None or stamp_ns - self._calibration_ns < _CALIBRATION_EVERY_NS:
+            return
+        of_biases = np.zeros((6, 6))
+        of_biases[:3, :3], of_biases[3:, 3:] = self.covariance.gyro_bias, self.covariance.accel_bias
+        self._calibration_ns = stamp_ns
+        self._calibration_estimate = self._calibration.estimate(states.calibration, states.biases, of_biases)
 
     def _leave_out_mismatches(self, window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
         """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
@@ -370,15 +425,17 @@ class MonocularEstimator:
 
     def _forget_first(self, window: Window) -> None:
         states = window.states
-        structure, places, ids = window.landmarks.structure(window.views, states.poses, self._cameras)
+        structure, places, ids = window.landmarks.structure(window.views, states.poses, states.cameras(self._cameras))
         leaving = np.isin(ids, window.views[0].landmark)
         measured = self._measured(window, structure.of(leaving))
         is_before = int(states.stamps_ns[0]) < self._first_pose_ns
         if not is_before:
             self._hand_over(measured.structure, states, places[leaving])
         step_s = (states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9
-        walks = np.repeat([self._imu.gyro_random_walk, self._imu.accel_random_walk], 3)
-        window.prior = without_first(measured, states, places[leaving], window.prior, walks**2 * step_s)
+        walk = np.sqrt(step_s) * np.diag(np.repeat([self._imu.gyro_random_walk, self._imu.accel_random_walk], 3))
+        if self._calibration is not None:
+            walk = self._calibration.walk(step_s)
+        window.prior = without_first(measured, states, places[leaving], window.prior, walk)
         window.names.end(window.views[0].landmark)
         window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
         del window.stationary[0]
@@ -391,7 +448,7 @@ class MonocularEstimator:
         """Hand over the views of some landmarks (L, 3), which no window will use again."""
         if self._on_views is None or not len(places):
             return
-        information, gradient = views_only(self._cameras, structure, self._sigma_px, states, places)
+        information, gradient = views_only(states.cameras(self._cameras), structure, self._sigma_px, states, places)
         kept = np.isin(np.arange(len(states.poses)), structure.state)
         rows = np.repeat(kept, 6)
         self._on_views(
@@ -454,7 +511,7 @@ class MonocularEstimator:
         self._since_ns, self._is_reported = stamp_ns, False
 
     def _new_initialiser(self) -> Initialiser:
-        return Initialiser(self._cameras, self._samples.between, _FIRST_SIGMA_PX)
+        return Initialiser(self._cameras, self._calibration, self._samples.between, _FIRST_SIGMA_PX)
 
     def _oldest_needed_ns(self, stamp_ns: int) -> int:
         """Return the stamp from which on IMU samples are needed at a frameset."""
@@ -475,10 +532,7 @@ def adjust_no_keyframes(rig: Rig) -> None:
     samples = InertialSamples(stamps, readings, keyframes, np.array([1e-3, 1e-2]), 50_000_000)
     states = States(keyframes, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3)), level_gravity(), np.zeros(6))
     prior = first_prior(states, np.ones(6), np.zeros(6), POSE_SIGMAS)
-    cameras = Cameras(
-        np.array([single.left.body_T_cam for single in rig.singles]),
-        np.array([single.left.focal_px for single in rig.singles]),
-    )
+    cameras = Cameras.of(rig)
     structure = Structure(
         np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros(2, dtype=np.int64), np.zeros((2, 2))
     )

@@ -19,6 +19,7 @@ from graphvio.geometry import se3, se3_inverse
 from graphvio.measurements.motion import Sighting
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import Adjusted, Measurements, Prior, States, adjust, first_prior, scale_sigma
+from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
 from graphvio.monocular.structure import Cameras, located
@@ -37,9 +38,13 @@ _MAX_IMU_ERROR2 = 60.0  # squared whitened error of an interval, of 9 dimensions
 _MAX_GRAVITY_EXCESS = 0.1  # m/s^2
 _STEPS = 40
 ACCEL_BIAS_SIGMA = 0.15
+_MAX_SIGMAS = 5.0
+_ROUGH, _ROUGH_STEPS = 10.0, 15  # sigmas of the first adjustment by a rig file that is wrong
+_DOUBTS_EVERY = 3  # windows that fit no motion with an exact file
 _OTHER_SCALES = (0.6, 1.7)
 _MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
 POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
+_NO_FACTORS = np.zeros(0)
 
 
 @dataclass(eq=False)
@@ -53,6 +58,7 @@ class Window:
         names: joins tracks to landmarks.
         landmarks: where these are.
         prior: what is known from before.
+        factors: (G,) by which the rig file's errors exceed its standard deviations.
     """
 
     states: States
@@ -61,6 +67,7 @@ class Window:
     names: LandmarkNames
     landmarks: Landmarks
     prior: Prior | None
+    factors: Float
 
 
 class Initialiser:
@@ -68,16 +75,26 @@ class Initialiser:
 
     Args:
         cameras: of the rig.
+        calibration: says how wrong the rig file may be; None where it is taken for exact.
         samples_of: Returns the IMU's samples of some instants.
         sigma_px: noise of a corner's position.
     """
 
-    def __init__(self, cameras: Cameras, samples_of: Callable[[np.ndarray], InertialSamples], sigma_px: float) -> None:
+    def __init__(
+        self,
+        cameras: Cameras,
+        calibration: WindowCalibration | None,
+        samples_of: Callable[[np.ndarray], InertialSamples],
+        sigma_px: float,
+    ) -> None:
         self._cameras = cameras
+        self._calibration = calibration
         self._samples_of = samples_of
         self._sigma_px = sigma_px
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
+        self._fits_no_motion = False  # the window that was tested last
+        self._contradicted = 0  # windows
         self.reason = "no image has come"
         self.scale_sigma = np.inf  # of the window that was tested last, as a share
 
@@ -105,14 +122,29 @@ class Initialiser:
         if is_stationary or len(self._keyframes) < min_keyframes or duration_s < min_duration_s:
             self.reason = "the images show too little motion"
             return None
-        try:
-            return self._solved()
-        except (np.linalg.LinAlgError, MeasurementError) as error:
-            self.reason = str(error)
-            return None
+        for factors in self._candidates():
+            try:
+                window = self._solved(factors)
+            except (np.linalg.LinAlgError, MeasurementError) as error:
+                self.reason = str(error)
+                return None
+            if window is not None or not self._fits_no_motion:
+                return window
+        return None
 
-    def _solved(self) -> Window | None:
-        """Solve for a window of all keyframes, and test it."""
+    def _candidates(self) -> list[Float]:
+        """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
+        if self._calibration is None:
+            return [_NO_FACTORS]
+        candidates = self._calibration.candidates
+        self._contradicted += self._fits_no_motion
+        is_tried = self._fits_no_motion and self._contradicted % _DOUBTS_EVERY == 0
+        return candidates if is_tried else candidates[:1]
+
+    def _solved(self, factors: Float) -> Window | None:
+        """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
+        self._fits_no_motion = False
+        file = None if self._calibration is None else self._calibration.file(factors)
         stamps = np.array([stamp for stamp, _, _ in self._keyframes])
         samples = self._samples_of(stamps)
         names, landmarks = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1), Landmarks()
@@ -127,44 +159,65 @@ class Initialiser:
             return None
         guess = first_guess(samples, structure, self._cameras, self._gyro_bias)
         biases = np.concatenate([guess.gyro_bias, np.zeros(3)])
-        states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases)
+        calibration = np.zeros(0 if self._calibration is None else self._calibration.size)
+        states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases, calibration)
         bias_sigmas = np.repeat([self._gyro_bias_sigma, ACCEL_BIAS_SIGMA], 3)
         prior = first_prior(states, bias_sigmas, np.concatenate([self._gyro_bias, np.zeros(3)]), POSE_SIGMAS)
         stationary = np.flatnonzero([still for _, _, still in self._keyframes])
         landmarks = Landmarks()
         fitting = 1.0
         for _ in range(2):
-            structure, places, ids = landmarks.structure(views, states.poses, self._cameras)
+            cameras = states.cameras(self._cameras)
+            structure, places, ids = landmarks.structure(views, states.poses, cameras)
             if len(ids) < _MIN_LANDMARKS:
                 self.reason = f"only {len(ids)} points stand still"
+                self._fits_no_motion = True
                 return None
-            places = located(states.poses, self._cameras, places, structure, self._sigma_px, True)
+            places = located(states.poses, cameras, places, structure, self._sigma_px, True)
             measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
-            adjusted = adjust(measured, states, places, prior, _STEPS)
+            if file is not None and fitting == 1.0:
+                # By the rig file, points are off by pixels: they are not distinguished from mismatches yet.
+                rough = adjust(
+                    measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file
+                )
+                states, places = rough.states, rough.landmarks
+            adjusted = adjust(measured, states, places, prior, _STEPS, file)
             states = adjusted.states
             landmarks.put(adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
             fitting *= 1.0 - float(off.mean())
             names.end(ids[off])
             views = [each.without(ids[off]) for each in views]
-        self.reason = self._fault(adjusted, fitting) or _ambiguity(measured, adjusted, prior)
+        self.reason = self._fault(adjusted, fitting, factors) or _ambiguity(measured, adjusted, prior, file)
         if self.reason:
             return None
-        return self._in_nav(Window(states, views, [k in stationary for k in range(n)], names, landmarks, prior))
+        still = [k in stationary for k in range(n)]
+        return self._in_nav(Window(states, views, still, names, landmarks, prior, factors))
 
-    def _fault(self, adjusted: Adjusted, fitting: float) -> str:
-        """Say why a window is not accepted, or nothing."""
+    def _fault(self, adjusted: Adjusted, fitting: float, factors: Float) -> str:
+        """Say why a window is not accepted, or nothing; a rig file that is wrong by factors understates noise, too."""
+        wrong_by = float(np.max(factors, initial=1.0))
         states, at = adjusted.states, adjusted.equations
+        self._fits_no_motion = True
         if fitting < _MIN_FITTING:
             return f"only {100 * fitting:.0f} % of the points fit one motion"
-        if not (at.imu_errors2 < _MAX_IMU_ERROR2).all():
+        if not (at.imu_errors2 < wrong_by**2 * _MAX_IMU_ERROR2).all():
             return "images and IMU contradict each other"
         if abs(float(np.linalg.norm(states.gravity)) - GRAVITY_M_S2) > _MAX_GRAVITY_EXCESS:
             return "images and IMU contradict each other about gravity"
+        if states.calibration.any() and not self._is_plausible(states, factors):
+            return "images and IMU contradict each other, whatever the calibration"
+        self._fits_no_motion = False
         self.scale_sigma = sigma = scale_sigma(states, at.hessian)
         if not sigma < MAX_SCALE_SIGMA:
             return f"the scale is known to {100 * sigma:.0f} % only"
         return ""
+
+    def _is_plausible(self, states: States, factors: Float) -> bool:
+        """Return whether calibration and biases are such as sensors have."""
+        of_accel = np.abs(states.biases[3:]) <= _MAX_SIGMAS * ACCEL_BIAS_SIGMA
+        calibration = self._calibration
+        return bool(of_accel.all()) and (calibration is None or calibration.is_plausible(states.calibration, factors))
 
     def _in_nav(self, window: Window) -> Window:
         """Turn a window level: its first pose has heading zero, and is the origin."""
@@ -190,7 +243,7 @@ def shared_points(sightings: Mapping[int, Sighting]) -> int:
     return sum(len(seen.rows) for sighting in sightings.values() for seen in sighting.elsewhere)
 
 
-def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior) -> str:
+def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior, file: Float | None) -> str:
     """Say whether another scale fits as well as the one that was found, or nothing.
 
     A covariance is of one minimum, and says nothing of others: the window is adjusted again from other scales.
@@ -203,7 +256,7 @@ def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior) -> str:
         frames[:, :3, 3] *= factor
         other = measured._replace(structure=measured.structure._replace(odom_T_landmark=frames))
         start = replace(states, poses=scaled, velocities=factor * states.velocities)
-        found = adjust(other, start, adjusted.landmarks * np.array([1.0, 1.0, 1.0 / factor]), prior, _STEPS)
+        found = adjust(other, start, adjusted.landmarks * np.array([1.0, 1.0, 1.0 / factor]), prior, _STEPS, file)
         apart = abs(_size(found.states) / _size(states) - 1.0)
         if apart > MAX_SCALE_SIGMA and found.equations.cost < cost + _MIN_WORSE:
             return f"scales {100 * apart:.0f} % apart fit as well as each other"

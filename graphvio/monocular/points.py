@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.measurements.motion import LocatedPoints
-from graphvio.monocular.adjustment import Adjusted, covariance_of
+from graphvio.monocular.adjustment import BIASES, GRAVITY, Adjusted, covariance_of
 from graphvio.monocular.sightings import Views
 from graphvio.monocular.structure import Structure
 
@@ -70,12 +70,13 @@ def located_points(solved: Solved) -> dict[int, LocatedPoints]:
 def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
     """Return points (K, 3) and covariances (K, 3, 3) of those landmarks (M,) whose depth is known, and which these are.
 
-    With poses x, a landmark is ``l - V^-1 (b + W^T x)``: its covariance is that for given poses, ``V^-1``, and what
-    those of the poses add.
+    With poses and cameras x, a landmark is ``l - V^-1 (b + W^T x)``: its covariance is that for given ones, ``V^-1``,
+    and what theirs adds.
     """
     (states, landmarks, at), structure = solved.adjusted, solved.structure
-    n_unknowns = 6 * len(states.poses)
-    joint = covariance_of(at.hessian, np.arange(n_unknowns))
+    n_poses, n_cameras = 6 * len(states.poses), at.eliminated.by_cameras.shape[2]
+    of_cameras = 9 * len(states.poses) + GRAVITY + BIASES + np.arange(n_cameras)
+    joint, n_unknowns = covariance_of(at.hessian, np.r_[:n_poses, of_cameras]), n_poses + n_cameras
     odom_R_body, position = states.poses[-1, :3, :3], states.poses[-1, :3, 3]
     points, covariances, known = np.zeros((len(rows), 3)), np.zeros((len(rows), 3, 3)), np.zeros(len(rows), dtype=bool)
     for i, row in enumerate(rows):
@@ -83,6 +84,7 @@ def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
         for n in range(structure.rows[row], structure.rows[row + 1]):
             k = 6 * structure.state[n]
             by_poses[:, k : k + 6] -= at.eliminated.by_pose[n]
+        by_poses[:, n_poses:] -= at.eliminated.by_cameras[row]
         inverse, w = at.eliminated.inverse[row], float(landmarks[row, 2])
         by_poses = inverse @ by_poses
         sigma_w = np.sqrt(inverse[2, 2] + by_poses[2] @ joint @ by_poses[2])
@@ -93,8 +95,8 @@ def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
         points[i] = (frame[:3, :3] @ in_frame + frame[:3, 3] - position) @ odom_R_body
         by_landmark = odom_R_body.T @ frame[:3, :3] @ np.column_stack([np.eye(3)[:, :2], -in_frame]) / w
         by_poses = by_landmark @ by_poses
-        by_poses[:, -6:-3] += skew(points[i])
-        by_poses[:, -3:] -= np.eye(3)
+        by_poses[:, n_poses - 6 : n_poses - 3] += skew(points[i])
+        by_poses[:, n_poses - 3 : n_poses] -= np.eye(3)
         covariances[i] = by_landmark @ inverse @ by_landmark.T + by_poses @ joint @ by_poses.T
         known[i] = True
     return points[known], covariances[known], known

@@ -10,6 +10,7 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.preintegration import Preintegrated, covering_samples, preintegrate
 
 _MARGIN_NS = 100_000_000
+_HELD_NS = 30_000_000
 
 
 class SampleBuffer:
@@ -19,11 +20,15 @@ class SampleBuffer:
         imu: Of the rig.
         noise_scale: Factor on its stated white noise.
         max_gap_ns: Between samples of one interval.
+
+    Attributes:
+        time_offset_s: Of the samples' stamps from those of the framesets, as it is estimated.
     """
 
     def __init__(self, imu: Imu, noise_scale: float, max_gap_ns: int) -> None:
         self._noise = noise_scale * np.array([imu.gyro_noise_density, imu.accel_noise_density])
         self._max_gap_ns = max_gap_ns
+        self.time_offset_s = 0.0
         self._waiting_ns: list[int] = []
         self._waiting: list[Float] = []
         self._stamps_ns, self._readings = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
@@ -45,7 +50,7 @@ class SampleBuffer:
             order = np.argsort(stamps, kind="stable")  # a corrected time offset may have moved the newest ones
             stamps, readings = stamps[order], readings[order]
         first = max(int(np.searchsorted(stamps, oldest_ns - _MARGIN_NS)) - 1, 0)
-        end = int(np.searchsorted(stamps, until_ns)) + 1
+        end = int(np.searchsorted(stamps, until_ns + self._offset_ns)) + 1
         self._waiting_ns, self._waiting = stamps[end:].tolist(), list(readings[end:])
         self._stamps_ns, self._readings = stamps[first:end], readings[first:end]
 
@@ -55,7 +60,8 @@ class SampleBuffer:
 
     def covers(self, start_ns: int, end_ns: int) -> bool:
         """Return whether the samples in use have no gap between two stamps."""
-        return bool(covering_samples(self._stamps_ns, start_ns, end_ns, 0.0, self._max_gap_ns)[1] >= 0)
+        stamps, _ = self._extended()
+        return bool(covering_samples(stamps, start_ns, end_ns, self.time_offset_s, self._max_gap_ns)[1] >= 0)
 
     def preintegrated(self, start_ns: int, end_ns: int, parameters: Float) -> Preintegrated:
         """Integrate the samples in use between two stamps, by the IMU's parameters (25,).
@@ -63,10 +69,22 @@ class SampleBuffer:
         Raises:
             MeasurementError: If they do not cover it.
         """
-        return preintegrate(
-            self._stamps_ns, self._readings, start_ns, end_ns, parameters, self._noise, self._max_gap_ns
-        )
+        return preintegrate(*self._extended(), start_ns, end_ns, parameters, self._noise, self._max_gap_ns)
 
     def between(self, stamps_ns: Int) -> InertialSamples:
         """Return the samples in use, for the intervals between the stamps (K,) of states."""
-        return InertialSamples(self._stamps_ns, self._readings, stamps_ns, self._noise, self._max_gap_ns)
+        return InertialSamples(*self._extended(), stamps_ns, self._noise, self._max_gap_ns)
+
+    @property
+    def _offset_ns(self) -> int:
+        return round(self.time_offset_s * 1e9)
+
+    def _extended(self) -> tuple[Int, Float]:
+        """Return the samples in use; where their time offset is estimated, the newest reading lasts a little longer.
+
+        An offset that has just been found may ask for samples that have not come; the next framesets have them.
+        """
+        if self.time_offset_s == 0.0 or not len(self._stamps_ns):
+            return self._stamps_ns, self._readings
+        held_ns = self._stamps_ns[-1] + min(_HELD_NS, self._max_gap_ns)
+        return np.append(self._stamps_ns, held_ns), np.concatenate([self._readings, self._readings[-1:]])

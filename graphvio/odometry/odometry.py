@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +31,7 @@ from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyfr
 from graphvio.odometry.imu_of_framesets import ImuOfFramesets
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
+from graphvio.odometry.singles_calibration import SinglesCalibration
 from graphvio.odometry.step import Step
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
@@ -53,7 +53,7 @@ class _Predicted(NamedTuple):
 
 
 def _config_of(rig: Rig, config: Config) -> Config:
-    """Return the configuration as a rig allows it: the calibration of a rig without pairs is not estimated.
+    """Return the configuration, if the rig allows it.
 
     Raises:
         ConfigError: If the configuration asks for what such a rig does not have.
@@ -65,7 +65,7 @@ def _config_of(rig: Rig, config: Config) -> Config:
             "the paper's filter and the estimation of the time offset need a stereo pair, and the rig has none; use "
             "fusion.estimator: smoother and fusion.estimate_time_offset: false"
         )
-    return replace(config, calibration=replace(config.calibration, online=False))
+    return config
 
 
 def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | FilterEstimator | MonocularEstimator]:
@@ -109,7 +109,9 @@ class Odometry:
         self._imu = ImuOfFramesets(rig, self.config, self._synchroniser, self._estimator, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
-        self._calibration = OnlineCalibration(rig, self.config, self._frontend, self._synchroniser, self.report)
+        self._calibration = (OnlineCalibration if rig.pairs else SinglesCalibration)(
+            rig, self.config, self._frontend, self._synchroniser, self.report
+        )
         self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
         self._rates = AngularRates()

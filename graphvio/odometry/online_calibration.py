@@ -55,7 +55,7 @@ class OnlineCalibration:
         self._is_reported = False
         self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()  # pairs
-        self._calibration = SelfCalibration(rig) if config.estimates_calibration else None
+        self._calibration = SelfCalibration(rig) if config.estimates_calibration and rig.pairs else None
         self._margin_px = 0.0
         if self._calibration is not None:
             self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]

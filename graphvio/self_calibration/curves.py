@@ -13,13 +13,16 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.parameters import (
-    BODY,
     CAMERA,
     INTRINSICS,
     PAIR,
+    SINGLE,
     STEREO,
+    first_place,
     is_linear,
+    n_of_cameras,
     relative_to_first,
+    single_cameras,
 )
 
 _DEG = float(np.rad2deg(1.0))
@@ -53,7 +56,7 @@ class Curve(NamedTuple):
 def curves_of(rig: Rig) -> list[Curve]:
     """Return the curves of a rig, those of a group in succession; biases are not among them."""
     by_group: dict[str, list[Curve]] = {}
-    for curve in (*_of_cameras(rig), *_of_pairs(rig), *_of_imu(rig)):
+    for curve in (*_of_cameras(rig), *_of_pairs(rig), *_of_singles(rig), *_of_imu(rig)):
         by_group.setdefault(curve.group, []).append(curve)
     return [curve for curves in by_group.values() for curve in curves]
 
@@ -73,21 +76,36 @@ def with_sigma(value: float, sigma: float) -> str:
 
 def _of_cameras(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
-    for j, pair in enumerate(rig.pairs):
-        for camera, at in ((pair.left, j * PAIR), (pair.right, j * PAIR + CAMERA)):
-            for i, axis in enumerate("xy"):
-                focal = 100.0 / camera.intrinsics[i]
-                yield Curve("focal lengths", "%", camera.name, f"f{axis}", focal * unit[at + i])
-                yield Curve("principal points", "px", camera.name, f"c{axis}", unit[at + 2 + i])
-            for i in np.flatnonzero(is_linear(camera))[:_SHOWN_DISTORTION]:
-                yield Curve("distortion", "1e-3", camera.name, f"d{i + 1}", 1e3 * unit[at + INTRINSICS + i])
+    lenses = [
+        (camera, j * PAIR + which * CAMERA)
+        for j, pair in enumerate(rig.pairs)
+        for which, camera in enumerate(pair.cameras)
+    ]
+    lenses += [(camera, j * SINGLE) for j, camera in enumerate(single_cameras(rig))]
+    for camera, at in lenses:
+        for i, axis in enumerate("xy"):
+            focal = 100.0 / camera.intrinsics[i]
+            yield Curve("focal lengths", "%", camera.name, f"f{axis}", focal * unit[at + i])
+            yield Curve("principal points", "px", camera.name, f"c{axis}", unit[at + 2 + i])
+        for i in np.flatnonzero(is_linear(camera))[:_SHOWN_DISTORTION]:
+            yield Curve("distortion", "1e-3", camera.name, f"d{i + 1}", 1e3 * unit[at + INTRINSICS + i])
+
+
+def _of_singles(rig: Rig) -> Iterator[Curve]:
+    unit = np.eye(_size(rig))
+    for j, camera in enumerate(single_cameras(rig)[1:], start=1):
+        relative = relative_to_first(rig, j) @ unit[: n_of_cameras(rig)]
+        against = f"cameras against {rig.singles[0].name}"
+        for i, axis in enumerate(_AXES):
+            yield Curve(f"{against}, rotation", "deg", camera.name, axis, _DEG * relative[i])
+            yield Curve(f"{against}, translation", "mm", camera.name, axis, 1e3 * relative[3 + i])
 
 
 def _of_pairs(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
     for j, pair in enumerate(rig.pairs):
         stereo = unit[j * PAIR + STEREO :]
-        relative = relative_to_first(rig, j) @ unit[: PAIR * len(rig.pairs)]
+        relative = relative_to_first(rig, j) @ unit[: n_of_cameras(rig)]
         for i, axis in enumerate(_AXES):
             yield Curve("left to right, rotation", "deg", pair.name, axis, _DEG * stereo[i])
         along = pair.right_T_left[:3, 3] / pair.baseline_m**2
@@ -102,10 +120,10 @@ def _of_imu(rig: Rig) -> Iterator[Curve]:
     if rig.imu is None:
         return
     unit = np.eye(_size(rig))
-    imu = unit[PAIR * len(rig.pairs) :]
+    imu, place = unit[n_of_cameras(rig) :], unit[first_place(rig)]
     for i, axis in enumerate(_AXES):
-        yield Curve("cameras to IMU, rotation", "deg", "", axis, _DEG * unit[BODY + i])
-        yield Curve("cameras to IMU, translation", "mm", "", axis, 1e3 * unit[BODY + 3 + i])
+        yield Curve("cameras to IMU, rotation", "deg", "", axis, _DEG * place[i])
+        yield Curve("cameras to IMU, translation", "mm", "", axis, 1e3 * place[3 + i])
     yield Curve("IMU, time offset", "ms", "", "", 1e3 * imu[TIME_OFFSET])
     for i, axis in enumerate(_AXES):
         yield Curve("IMU, gyro's scale", "%", "", axis, 100.0 * imu[GYRO_MATRIX + 4 * i])
@@ -113,4 +131,4 @@ def _of_imu(rig: Rig) -> Iterator[Curve]:
 
 
 def _size(rig: Rig) -> int:
-    return PAIR * len(rig.pairs) + (PARAMETERS if rig.imu is not None else 0)
+    return n_of_cameras(rig) + (PARAMETERS if rig.imu is not None else 0)

@@ -9,9 +9,21 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphvio.arrays import Float
+from graphvio.rig import Camera
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
+from graphvio.self_calibration.parameters import (
+    BODY,
+    CAMERA,
+    INTRINSICS,
+    PAIR,
+    SINGLE,
+    STEREO,
+    first_place,
+    n_of_cameras,
+    relative_to_first,
+    single_cameras,
+)
 
 _FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard deviations
 _OBSERVED = 0.5  # of the prior's standard deviation
@@ -109,24 +121,35 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
     deg = float(np.rad2deg(1.0))
     for j, pair in enumerate(rig.pairs):
         at = j * PAIR
-        for camera, start in ((pair.left, at), (pair.right, at + CAMERA)):
-            focal = 100.0 / float(camera.intrinsics[:2].mean())
-            yield f"{camera.name}, focal lengths", "%", focal, whole[start : start + 2], 0.05, _DEPTHS
-            rows = whole[start + 2 : start + INTRINSICS]
-            yield f"{camera.name}, principal point", "px", 1.0, rows, 0.3, _DEPTHS
+        for which, camera in enumerate(pair.cameras):
+            yield from _of_lens(camera, whole[at + which * CAMERA :])
         stereo, body = at + STEREO, at + BODY
         name = f"pair {pair.name}"
         yield f"{name}, rotation left to right", "deg", deg, whole[stereo : stereo + 3], 0.005, _DEPTHS
         yield f"{name}, translation left to right", "mm", 1e3, whole[stereo + 3 : body], 0.1, SCALE_MOTION
         if j > 0:
-            relative = relative_to_first(rig, j) @ whole[: PAIR * len(rig.pairs)]
+            relative = relative_to_first(rig, j) @ whole[: n_of_cameras(rig)]
             yield f"{name}, rotation against {rig.pairs[0].name}", "deg", deg, relative[:3], 0.03, _TURN
             yield f"{name}, translation against {rig.pairs[0].name}", "mm", 1e3, relative[3:], 3.0, _TURN
+    for j, camera in enumerate(single_cameras(rig)):
+        yield from _of_lens(camera, whole[j * SINGLE :])
+        if j > 0:
+            name, first = f"camera {camera.name}", rig.singles[0].name
+            relative = relative_to_first(rig, j) @ whole[: n_of_cameras(rig)]
+            yield f"{name}, rotation against {first}", "deg", deg, relative[:3], 0.03, _TURN
+            yield f"{name}, translation against {first}", "mm", 1e3, relative[3:], 3.0, _TURN
     if rig.imu is None:
         return
-    at = PAIR * len(rig.pairs)
-    yield "cameras to IMU, rotation", "deg", deg, whole[BODY : BODY + 3], 0.1, _TURN
-    yield "cameras to IMU, translation", "mm", 1e3, whole[BODY + 3 : PAIR], 3.0, _TURN
+    at, place = n_of_cameras(rig), whole[first_place(rig)]
+    yield "cameras to IMU, rotation", "deg", deg, place[:3], 0.1, _TURN
+    yield "cameras to IMU, translation", "mm", 1e3, place[3:], 3.0, _TURN
     yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN
     yield "IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN
     yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION
+
+
+def _of_lens(camera: Camera, rows: Float) -> Iterator[tuple[str, str, float, Float, float, str]]:
+    """Yield the parts of a lens, whose parameters are the first ones of some rows (N, C)."""
+    focal = 100.0 / float(camera.intrinsics[:2].mean())
+    yield f"{camera.name}, focal lengths", "%", focal, rows[:2], 0.05, _DEPTHS
+    yield f"{camera.name}, principal point", "px", 1.0, rows[2:INTRINSICS], 0.3, _DEPTHS

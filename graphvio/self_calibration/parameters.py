@@ -5,6 +5,7 @@ others, are kept: see `graphvio.cameras.LINEAR_COEFFICIENTS`.
 
 A vector is the difference from the nominal rig, that of the rig file. Rotations are rotation vectors: that of the right
 camera turns the left camera's frame, ``right_R_left Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
+Single cameras have parameters in a rig without pairs, and none beside pairs.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.cameras import COEFFICIENTS, LINEAR_COEFFICIENTS, N_BASIS
 from graphvio.geometry import skew, so3_exp
-from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.rig import Camera, Rig, SingleCamera, StereoPair
 
 INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, N_BASIS, 3, 3
 CAMERA = INTRINSICS + DISTORTION
 LEFT, RIGHT, STEREO, BODY = 0, CAMERA, 2 * CAMERA, 2 * CAMERA + 6
 PAIR = BODY + 6
 """Number of parameters of a pair: left camera, right camera, ``right_T_left``, ``body_T_left``."""
+PLACE, SINGLE = CAMERA, CAMERA + 6
+"""Where those of ``body_T_cam`` of a single camera begin, after the lens, and how many there are in all."""
 
 
 _CAMERA_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "d1", "d2", "d3", "d4", "d5")
@@ -32,8 +35,11 @@ _MATRIX = tuple(f"{row}{column}" for row in _AXES for column in _AXES)
 
 
 def parameter_names(rig: Rig) -> list[str]:
-    """Return the names of a rig's parameters, in their order: of its pairs, and of its IMU if there is one."""
+    """Return the names of a rig's parameters, in their order: of its cameras, and of its IMU if there is one."""
     names = []
+    for camera in single_cameras(rig):
+        names += [f"{camera.name}.{name}" for name in _CAMERA_NAMES]
+        names += [f"{camera.name}.body_T_cam.{kind}{axis}" for kind in ("r", "t") for axis in _AXES]
     for pair in rig.pairs:
         names += [f"{camera.name}.{name}" for camera in (pair.left, pair.right) for name in _CAMERA_NAMES]
         for transform in ("right_T_left", "body_T_left"):
@@ -45,6 +51,39 @@ def parameter_names(rig: Rig) -> list[str]:
     return names
 
 
+def single_cameras(rig: Rig) -> list[Camera]:
+    """Return the single cameras that have parameters: those of a rig without pairs."""
+    return [] if rig.pairs else [single.left for single in rig.singles]
+
+
+def n_of_cameras(rig: Rig) -> int:
+    """Return the number of a rig's parameters without those of its IMU."""
+    return PAIR * len(rig.pairs) + SINGLE * len(single_cameras(rig))
+
+
+def first_place(rig: Rig) -> slice:
+    """Return where the parameters (6,) of the place of the first pair, or single camera, in body are."""
+    end = PAIR if rig.pairs else SINGLE
+    return slice(end - 6, end)
+
+
+def moved_cameras(rig: Rig, difference: Float) -> Rig:
+    """Return a rig whose cameras differ by a vector (P * PAIR,), or (S * SINGLE,) where it has no pairs."""
+    if rig.pairs:
+        return RigCalibration.of(rig).moved(difference).applied_to(rig)
+    singles = []
+    for single, own in zip(rig.singles, difference.reshape(-1, SINGLE), strict=True):
+        camera, place = single.left, own[PLACE:]
+        distortion, body_T_cam = camera.distortion.copy(), camera.body_T_cam.copy()
+        distortion[:DISTORTION] += own[INTRINSICS:PLACE]
+        body_T_cam[:3, :3] = so3_exp(place[:3].copy()) @ body_T_cam[:3, :3]
+        body_T_cam[:3, 3] += place[3:]
+        intrinsics = camera.intrinsics + own[:INTRINSICS]
+        moved = replace(camera, intrinsics=intrinsics, distortion=distortion, body_T_cam=body_T_cam)
+        singles.append(SingleCamera(moved))
+    return replace(rig, singles=tuple(singles))
+
+
 def is_linear(camera: Camera) -> Bool:
     """Return which of a camera's first coefficients (DISTORTION,) are estimated: those that the model is linear in."""
     names, linear = COEFFICIENTS[camera.model], LINEAR_COEFFICIENTS[camera.model]
@@ -52,15 +91,16 @@ def is_linear(camera: Camera) -> Bool:
 
 
 def relative_to_first(rig: Rig, j: int) -> Float:
-    """Return the derivatives (6, P * PAIR) of pair j's rotation and translation, in body's axes, seen from pair 0.
+    """Return the derivatives (6, `n_of_cameras`) of a group's rotation and translation in body, seen from group 0.
 
-    Where body turns or moves against all cameras, the pairs' places in it change, and none of these differences does.
+    Where body turns or moves against all cameras, their places in it change, and none of these differences does.
     """
-    rows = np.zeros((6, PAIR * len(rig.pairs)))
-    first, own = rows[:, BODY:PAIR], rows[:, j * PAIR + BODY : (j + 1) * PAIR]
+    place = first_place(rig)
+    rows, own_end = np.zeros((6, n_of_cameras(rig))), (j + 1) * place.stop
+    first, own = rows[:, place], rows[:, own_end - 6 : own_end]
     first -= np.eye(6)
     own += np.eye(6)
-    first[3:, :3] += skew(rig.pairs[j].left.body_T_cam[:3, 3] - rig.pairs[0].left.body_T_cam[:3, 3])
+    first[3:, :3] += skew(rig.groups[j].left.body_T_cam[:3, 3] - rig.groups[0].left.body_T_cam[:3, 3])
     return rows
 
 

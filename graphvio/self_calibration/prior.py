@@ -7,7 +7,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import CalibrationSigmas
 from graphvio.geometry import skew
-from graphvio.rig import Rig, StereoPair
+from graphvio.rig import Camera, CameraGroup, Rig, StereoPair
 from graphvio.self_calibration.evidence import FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import (
     ACCEL_BIAS,
@@ -24,8 +24,11 @@ from graphvio.self_calibration.parameters import (
     INTRINSICS,
     PAIR,
     STEREO,
+    first_place,
     is_linear,
+    n_of_cameras,
     relative_to_first,
+    single_cameras,
 )
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
@@ -38,18 +41,18 @@ _CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors hav
 
 
 def file_prior(rig: Rig) -> FilePrior:
-    """Return the prior of all parameters of a rig, of its pairs and its IMU, by its `CalibrationSigmas`.
+    """Return the prior of all parameters of a rig, of its cameras and its IMU, by its `CalibrationSigmas`.
 
-    Cameras and left to right are one group, the places of the pairs and the IMU another one.
+    Cameras and left to right are one group, their places in body and the IMU another one.
     """
-    of_pairs = _covariance_of_pairs(rig)
-    n = len(of_pairs)
+    of_cameras = _covariance_of_cameras(rig)
+    n, size = len(of_cameras), first_place(rig).stop
     group = np.full(n, _CAMERAS)
-    group.reshape(-1, PAIR)[:, BODY:] = _PLACES
+    group.reshape(-1, size)[:, -6:] = _PLACES
     if rig.imu is None:
-        return FilePrior(of_pairs, group)
+        return FilePrior(of_cameras, group)
     covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
-    covariance[:n, :n] = of_pairs
+    covariance[:n, :n] = of_cameras
     covariance[n:, n:] = np.diag(_sigmas_of_imu(rig.calibration_sigmas) ** 2)
     of_imu = np.full(PARAMETERS, _PLACES)
     of_imu[:GYRO_MATRIX] = _NO_GROUP
@@ -66,7 +69,7 @@ def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
     """
     walk = share**2 * prior.covariance
     if rig.imu is not None:
-        biases = PAIR * len(rig.pairs) + np.arange(GYRO_BIAS, GYRO_MATRIX)
+        biases = n_of_cameras(rig) + np.arange(GYRO_BIAS, GYRO_MATRIX)
         walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         walk[biases, biases] = (_BIAS_WALK_FACTOR * walks) ** 2
     return walk
@@ -95,18 +98,23 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
         rig: with the calibration of the posterior.
         posterior: of the difference from a rig file.
     """
-    covariance = posterior.covariance
-    of_pair = [_sigmas(covariance, slice(j * PAIR, (j + 1) * PAIR)) for j in range(len(rig.pairs))]
-    first, stereo_at = of_pair[0][BODY:], slice(STEREO, STEREO + 3)
-    of_pairs = covariance[: PAIR * len(rig.pairs), : PAIR * len(rig.pairs)]
-    rows = [relative_to_first(rig, j) for j in range(1, len(rig.pairs))]
-    relative = [np.sqrt(np.diag(each @ of_pairs @ each.T)) for each in rows] or [first]
+    covariance, known, size = posterior.covariance, rig.calibration_sigmas, first_place(rig).stop
+    groups: tuple[CameraGroup, ...] = rig.pairs or rig.singles
+    of_cameras = covariance[: n_of_cameras(rig), : n_of_cameras(rig)]
+    of_group = [_sigmas(covariance, slice(j * size, (j + 1) * size)) for j in range(len(groups))]
+    first = of_group[0][-6:]
+    rows = [relative_to_first(rig, j) for j in range(1, len(groups))]
+    relative = [np.sqrt(np.diag(each @ of_cameras @ each.T)) for each in rows] or [first]
     cameras = [
-        (camera, of_pair[j][which * CAMERA : (which + 1) * CAMERA])
-        for j, pair in enumerate(rig.pairs)
-        for which, camera in enumerate((pair.left, pair.right))
+        (camera, of_group[j][which * CAMERA : (which + 1) * CAMERA])
+        for j, group in enumerate(groups)
+        for which, camera in enumerate(group.cameras)
     ]
-    known = rig.calibration_sigmas
+    stereo_deg, baseline_share = known.stereo_rotation_deg, known.stereo_baseline_share
+    if rig.pairs:
+        of_stereo = [(pair, sigmas[STEREO:BODY]) for pair, sigmas in zip(rig.pairs, of_group, strict=True)]
+        stereo_deg = float(np.rad2deg(max(sigmas[:3].max() for _, sigmas in of_stereo)))
+        baseline_share = max(float(sigmas[3:].max()) / pair.baseline_m for pair, sigmas in of_stereo)
     imu = _sigmas(covariance, slice(-PARAMETERS, None)) if rig.imu is not None else _sigmas_of_imu(known)
     matrix = imu[GYRO_MATRIX:TIME_OFFSET].reshape(2, 3, 3)
     diagonal = np.diagonal(matrix, axis1=1, axis2=2)
@@ -114,11 +122,8 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
         focal_share=max(float((sigmas[:2] / camera.intrinsics[:2]).max()) for camera, sigmas in cameras),
         principal_point_px=max(float(sigmas[2:INTRINSICS].max()) for _, sigmas in cameras),
         distortion_share=known.distortion_share,
-        stereo_rotation_deg=float(np.rad2deg(max(sigmas[stereo_at].max() for sigmas in of_pair))),
-        stereo_baseline_share=max(
-            float(sigmas[STEREO + 3 : BODY].max()) / pair.baseline_m
-            for sigmas, pair in zip(of_pair, rig.pairs, strict=True)
-        ),
+        stereo_rotation_deg=stereo_deg,
+        stereo_baseline_share=baseline_share,
         body_rotation_deg=float(np.rad2deg(first[:3].max())),
         body_translation_m=float(first[3:].max()),
         pair_rotation_deg=float(np.rad2deg(max(sigmas[:3].max() for sigmas in relative))),
@@ -144,20 +149,21 @@ def _sigmas_of_imu(known: CalibrationSigmas) -> Float:
     return sigmas
 
 
-def _covariance_of_pairs(rig: Rig) -> Float:
-    """Return the covariance of the pairs' parameters, see `graphvio.self_calibration.parameters`."""
-    known, n_pairs = rig.calibration_sigmas, len(rig.pairs)
-    covariance = np.zeros((n_pairs * PAIR, n_pairs * PAIR))
-    for j, pair in enumerate(rig.pairs):
-        of_pair = slice(j * PAIR, j * PAIR + BODY)
-        covariance[of_pair, of_pair] = np.diag(np.maximum(_sigmas_of_pair(pair, known), _MIN_SIGMA) ** 2)
+def _covariance_of_cameras(rig: Rig) -> Float:
+    """Return the covariance of the cameras' parameters, see `graphvio.self_calibration.parameters`."""
+    known, size = rig.calibration_sigmas, first_place(rig).stop
+    groups: tuple[CameraGroup, ...] = rig.pairs or rig.singles
+    covariance = np.zeros((len(groups) * size, len(groups) * size))
+    own = [_sigmas_of_pair(pair, known) for pair in rig.pairs]
+    own += [_sigmas_of_lens(camera, known) for camera in single_cameras(rig)]
     common = np.repeat([np.deg2rad(known.body_rotation_deg), known.body_translation_m], 3) ** 2
     single = np.repeat([np.deg2rad(known.pair_rotation_deg), known.pair_translation_m], 3) ** 2
-    by_common = np.zeros((n_pairs * PAIR, 6))  # body turns about its origin, which moves the cameras in it
-    for j, pair in enumerate(rig.pairs):
-        place = slice(j * PAIR + BODY, (j + 1) * PAIR)
+    by_common = np.zeros((len(covariance), 6))  # body turns about its origin, which moves the cameras in it
+    for j, (group, sigmas) in enumerate(zip(groups, own, strict=True)):
+        inner, place = slice(j * size, (j + 1) * size - 6), slice((j + 1) * size - 6, (j + 1) * size)
+        covariance[inner, inner] = np.diag(np.maximum(sigmas, _MIN_SIGMA) ** 2)
         by_common[place] = np.eye(6)
-        by_common[place][3:, :3] = -skew(pair.left.body_T_cam[:3, 3])
+        by_common[place][3:, :3] = -skew(group.left.body_T_cam[:3, 3])
         if j > 0:
             covariance[place, place] = np.diag(single)
     covariance += (by_common * common) @ by_common.T
@@ -167,13 +173,19 @@ def _covariance_of_pairs(rig: Rig) -> Float:
 def _sigmas_of_pair(pair: StereoPair, known: CalibrationSigmas) -> Float:
     """Return the standard deviations (BODY,) of a pair's cameras and of left to right."""
     sigmas = np.zeros(BODY)
-    for which, camera in enumerate((pair.left, pair.right)):
-        at = which * CAMERA
-        sigmas[at : at + 2] = known.focal_share * camera.intrinsics[:2]
-        sigmas[at + 2 : at + INTRINSICS] = known.principal_point_px
-        given = np.where(is_linear(camera), camera.distortion[:DISTORTION], 0.0)
-        size = np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)
-        sigmas[at + INTRINSICS : at + CAMERA] = known.distortion_share * size
+    for which, camera in enumerate(pair.cameras):
+        sigmas[which * CAMERA : (which + 1) * CAMERA] = _sigmas_of_lens(camera, known)
     sigmas[STEREO : STEREO + 3] = np.deg2rad(known.stereo_rotation_deg)
     sigmas[STEREO + 3 :] = known.stereo_baseline_share * pair.baseline_m
+    return sigmas
+
+
+def _sigmas_of_lens(camera: Camera, known: CalibrationSigmas) -> Float:
+    """Return the standard deviations (CAMERA,) of a camera's lens."""
+    sigmas = np.zeros(CAMERA)
+    sigmas[:2] = known.focal_share * camera.intrinsics[:2]
+    sigmas[2:INTRINSICS] = known.principal_point_px
+    given = np.where(is_linear(camera), camera.distortion[:DISTORTION], 0.0)
+    size = np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)
+    sigmas[INTRINSICS:] = known.distortion_share * size
     return sigmas

@@ -1,0 +1,145 @@
+"""Calibration of single cameras and IMU as unknowns of the window: how wrong the rig file is, and what is known of it.
+
+As long as the measurements say nothing against the rig file, it is taken for exact, and the window is solved without
+these unknowns; what left the window before still knows what it would have said of them. Once it speaks against the
+file, they are solved for with the states, as part of the same window.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.linear_algebra import cholesky
+from graphvio.rig import Rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OFFSET
+from graphvio.self_calibration.parameters import n_of_cameras
+from graphvio.self_calibration.prior import file_prior
+
+_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of lenses, and of places and the IMU
+_MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts of it that nothing has shown yet
+_FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
+_MAX_SIGMAS = 4.0  # no file is so wrong: the window is
+_WALK = 0.01  # in one second, as a share of the file's standard deviations
+
+
+class WindowCalibration:
+    """What is known of the calibration of a rig of single cameras and an IMU.
+
+    The difference from the rig file is ``[cameras C * SINGLE, IMU without its biases 19]``.
+
+    Args:
+        rig: of the rig file, with how far its calibration is known.
+
+    Attributes:
+        factors: (G,) by which the file's errors exceed its standard deviations, of lenses and of places with the IMU;
+            `EXACT` where the file is as good as exact.
+        log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        assert rig.imu is not None
+        self._rig = rig
+        whole, n_cameras = file_prior(rig), n_of_cameras(rig)
+        self._rows = np.r_[:n_cameras, n_cameras + GYRO_MATRIX : n_cameras + PARAMETERS]
+        self._biases = n_cameras + np.arange(GYRO_MATRIX)
+        self._prior = FilePrior(
+            np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]), whole.group[self._rows]
+        )
+        self._whole = whole
+        self._evidence = Evidence.none(len(self._rows))
+        self._bias_walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
+        self._walk: Float = _WALK * cholesky(self._prior.covariance)
+        self.factors = self.exact_factors
+        self.log_bayes_factor = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self._rows)
+
+    @property
+    def exact_factors(self) -> Float:
+        """The factors (G,) of an exact file."""
+        return np.full(self._prior.n_groups, EXACT)
+
+    @property
+    def is_file_exact(self) -> bool:
+        """Whether the measurements say nothing against the rig file."""
+        return bool((self.factors == EXACT).all())
+
+    @property
+    def candidates(self) -> list[Float]:
+        """Factors (G,) with which a first window is tried."""
+        if not self.is_file_exact:
+            return [self.factors]
+        return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]
+
+    def file(self, factors: Float) -> Float | None:
+        """Return the information (F, F) of a rig file that is wrong by some factors (G,), None where it is exact."""
+        if (factors == EXACT).all():
+            return None
+        return np.asarray(np.linalg.inv(self._prior.with_factors(factors)))
+
+    def is_plausible(self, difference: Float, factors: Float) -> bool:
+        """Return whether a difference (F,) is within four standard deviations of a file that is wrong by factors."""
+        sigmas = self._prior.of_each(factors) * np.sqrt(np.diag(self._prior.covariance))
+        return bool((np.abs(difference) <= _MAX_SIGMAS * sigmas).all())
+
+    def walk(self, seconds: float) -> Float:
+        """Return the lower Cholesky factor (6 + F, 6 + F) of what biases and calibration change in some time.
+
+        Of a file that is exact, the calibration stays.
+        """
+        n = len(self._bias_walks)
+        walk = np.zeros((n + self.size, n + self.size))
+        walk[:n, :n] = np.diag(self._bias_walks)
+        if not self.is_file_exact:
+            walk[n:, n:] = self._walk
+        return np.asarray(np.sqrt(seconds) * walk)
+
+    def update(self, evidence: Evidence) -> bool:
+        """Take what the window and what left it say of the calibration.
+
+        Returns:
+            Whether the factors have changed.
+        """
+        before, self._evidence = self.factors, evidence
+        found, self.log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
+        if not self.is_file_exact or (found != EXACT).any():
+            self.factors = np.maximum(found, _MIN_FACTOR)
+        return not np.array_equal(self.factors, before)
+
+    def estimate(self, difference: Float, biases: Float, bias_covariance: Float) -> CalibrationEstimate:
+        """Return what is known of all parameters.
+
+        Args:
+            difference: (F,) that is in force.
+            biases: (6,) of the IMU.
+            bias_covariance: (6, 6).
+        """
+        factors = np.maximum(self.factors, _MIN_FACTOR)
+        if self.is_file_exact:
+            factors = np.ones_like(factors)
+        own = self._evidence.given(self._prior, factors)
+        n = len(self._whole.covariance)
+        mean, information, in_force = np.zeros(n), np.zeros((n, n)), np.zeros(n)
+        mean[self._rows], mean[self._biases] = own.mean, biases
+        information[np.ix_(self._rows, self._rows)] = own.information
+        information[np.ix_(self._biases, self._biases)] = np.linalg.inv(bias_covariance)
+        in_force[self._rows], in_force[self._biases] = difference, biases
+        return CalibrationEstimate(
+            self._rig, Gaussian(mean, information), in_force, self.factors.copy(), self.log_bayes_factor
+        )
+
+    @property
+    def file_covariance(self) -> Float:
+        """Covariance of all parameters, with the biases, by the rig file."""
+        return self._whole.covariance
+
+
+def time_offset_s(difference: Float) -> float:
+    """Return the time offset that is in force, less the rig file's, of a difference (F,); 0 of an empty one."""
+    return float(difference[TIME_OFFSET - PARAMETERS]) if len(difference) else 0.0
