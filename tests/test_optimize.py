@@ -119,6 +119,16 @@ def test_optimize_one_camera_improves_on_online(of_one_camera: Path) -> None:
     assert session["framesets"] == len(load_trajectory(of_one_camera / "trajectory_optimized.txt"))
 
 
+def test_fleet_one_camera_equals_optimize(of_one_camera: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
+    listed, out = tmp_path / "list.txt", tmp_path / "out"
+    listed.write_text(f"{walk}\n")
+    arguments = [listed, "--cameras", "0", "--no-pairs", "--config", settings, "--workers", "1", "--out", out]
+    finished = CliRunner().invoke(app, ["fleet", "optimize", *map(str, arguments)])
+    assert finished.exit_code == 0, finished.output
+    for name in ("trajectory_optimized.txt", "covariance.csv", "graph.g2o", "loops.npz"):
+        assert (out / "walk" / name).read_bytes() == (of_one_camera / name).read_bytes(), name
+
+
 @pytest.mark.parametrize("with_loops", [False, True])
 def test_optimize_one_camera_is_consistent(of_one_camera: Path, walk: Path, with_loops: bool) -> None:
     """Where position and heading are those of the first state."""

@@ -9,7 +9,7 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish, with_json
-from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parsed_pairs, parsed_topics, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parsed_cameras, parsed_pairs, parsed_topics, warn
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -60,6 +60,8 @@ def optimize(
     topics: options.Topics = None,
     config: options.ConfigName = "default",
     pairs: options.Pairs = None,
+    cameras: options.Cameras = None,
+    no_pairs: options.NoPairs = False,
     no_imu: options.NoImu = False,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     refine_calibration: Annotated[
@@ -70,7 +72,7 @@ def optimize(
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Optimise many recorded sessions, each by itself, and write a table of all.
+    """Optimise many sessions, each by itself, and write a table.
 
     A session that fails affects no other: it is tried three times, and then has its error in the table. Ends with exit
     code 0; with 2 where the input cannot be used; with 3 where a session failed. When run again with the same --out, it
@@ -101,7 +103,8 @@ def optimize(
     settings = Config.load(config)
     loaded = None if rig is None else load_rig(rig)
     numbers = None if pairs is None else tuple(parsed_pairs(pairs))
-    reading = Reading(numbers, not no_imu, tuple(parsed_topics(topics).items()), from_s, to_s)
+    names = None if cameras is None else tuple(parsed_cameras(cameras))
+    reading = Reading(numbers, names, not no_pairs, not no_imu, tuple(parsed_topics(topics).items()), from_s, to_s)
     listed = list_sessions(sessions)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are printed below
     try:

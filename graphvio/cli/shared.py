@@ -151,6 +151,11 @@ def parsed_pairs(text: str) -> list[int]:
         raise RigError(f"--pairs {text}: give numbers separated by commas, such as 0,1") from None
 
 
+def parsed_cameras(text: str) -> list[str]:
+    """Parse the names of cameras."""
+    return [name.strip() for name in text.split(",")]
+
+
 def chosen_rig(
     rig: Rig, pairs: str | None = None, cameras: str | None = None, no_pairs: bool = False, no_imu: bool = False
 ) -> Rig:
@@ -158,7 +163,7 @@ def chosen_rig(
     if pairs is not None:
         rig = rig.with_pairs(parsed_pairs(pairs))
     if cameras is not None:
-        rig = rig.with_only([name.strip() for name in cameras.split(",")])
+        rig = rig.with_only(parsed_cameras(cameras))
     if no_pairs:
         rig = rig.without_pairs()
     return rig.without_imu() if no_imu else rig

@@ -44,6 +44,8 @@ class Reading:
     """What is read of each recording, as by the options of ``graphvio optimize``."""
 
     pairs: tuple[int, ...] | None = None  # numbers of the stereo pairs; None for all
+    cameras: tuple[str, ...] | None = None  # names of the cameras; None for all
+    with_pairs: bool = True  # whether pairs stay pairs; else each camera is a single one
     with_imu: bool = True  # whether the IMU is used
     topics: tuple[tuple[str, str], ...] = ()  # cameras of the rig, or ``imu``, with their topics
     from_s: float | None = None  # second of the recording to begin at
@@ -58,6 +60,8 @@ class Reading:
 
         source = opened(rig)
         chosen = source.rig if self.pairs is None else source.rig.with_pairs(list(self.pairs))
+        chosen = chosen if self.cameras is None else chosen.with_only(list(self.cameras))
+        chosen = chosen if self.with_pairs else chosen.without_pairs()
         chosen = chosen if self.with_imu else chosen.without_imu()
         return source if chosen is source.rig else opened(chosen)
 
