@@ -100,7 +100,8 @@ def _names(param: Any) -> str:
     annotation = param.type_descriptor.annotation
     value = param.metavar or _VALUES.get(annotation, "") or "|".join(map(str, get_args(annotation))) or "VALUE"
     if param.param_type_name == "argument":
-        return f"{param.metavar or param.name.upper()}{'...' if param.nargs < 0 else ''}"
+        name = f"{param.metavar or param.name.upper()}{'...' if param.nargs < 0 else ''}"
+        return name if param.required else f"[{name}]"
     options = [*param.opts, *param.secondary_opts]
     return ", ".join(options if param.is_flag else [f"{option} {value}" for option in options])
 

@@ -31,7 +31,7 @@ def optimize(
         list[Path],
         typer.Argument(
             help="Recordings of one place: folders (EuRoC/ASL, TUM-VI, KITTI), sessions (.mcap) or ROS bags.",
-            metavar="SOURCE...",
+            metavar="SOURCE",
         ),
     ],
     rig: options.RigFile = None,
