@@ -42,17 +42,35 @@ def test_a_wrong_command_line_names_the_help_of_its_command(typed: list[str], hi
     assert f"({hint}" in ran.stderr
 
 
-@pytest.mark.parametrize(("typed", "found"), [("graphvio cal", "calibrate-trajectories"), ("graphvio ru", "run")])
-def test_the_shell_completes_commands(typed: str, found: str) -> None:
+@pytest.mark.parametrize(
+    ("typed", "found"),
+    [
+        ("graphvio cal", {"calibrate", "calibrate-trajectories"}),
+        ("graphvio run --cam", {"--cameras"}),
+        ("graphvio run --config ", {"default", "fast", "paper"}),
+        ("graphvio benchmark ", {"euroc", "tum-vi", "uzh-fpv", "kitti", "hilti-2022", "monado"}),
+        ("graphvio simulate c", {"calibration", "corridor"}),
+        ("graphvio simulate --rig st", {"stereo", "stereo+back"}),
+        ("graphvio simulate --calibration-component imu-", {"imu-scale", "imu-misalignment", "imu-noise"}),
+        ("graphvio simulate --rig-change ", {"thermal", "knock"}),
+        ("graphvio calibrate --what ", {"pairs", "stereo", "cameras", "imu", "all"}),
+        ("graphvio calibrate --scale ", {"auto", "estimate", "fixed"}),
+        ("graphvio convert --format ros", {"rosbag1", "rosbag2"}),
+        ("graphvio live r", {"realsense", "ros2", "replay"}),
+        ("graphvio serve v", {"v4l2"}),
+    ],
+)
+def test_the_shell_completes(typed: str, found: set[str]) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "graphvio"],
-        env=os.environ | {"_GRAPHVIO_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": "1"},
+        env=os.environ
+        | {"_GRAPHVIO_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))},
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
-    assert found in done.stdout.split(), done.stderr
+    assert set(done.stdout.split()) == found, done.stderr
 
 
 def _without_matplotlib(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:

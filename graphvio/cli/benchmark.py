@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphvio.cli import options
+from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, warn
 
@@ -19,7 +19,12 @@ _PLAIN_WIDTH = 160  # of a table in a file, whose columns need not be cut
 
 def benchmark(
     dataset: Annotated[
-        str, typer.Argument(help="Data set: euroc, tum-vi, uzh-fpv, kitti, hilti-2022 or monado.", metavar="DATASET")
+        str,
+        typer.Argument(
+            help="Data set: euroc, tum-vi, uzh-fpv, kitti, hilti-2022 or monado.",
+            metavar="DATASET",
+            autocompletion=completion.dataset,
+        ),
     ],
     folder: Annotated[Path, typer.Argument(help="Folder that holds its sequences, at any place.")],
     out: Annotated[

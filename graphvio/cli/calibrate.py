@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphvio.cli import options
+from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, names_of, open_recording, warn
 
@@ -31,7 +31,13 @@ def calibrate(
     ] = None,
     report: options.ReportFolder = None,
     what: Annotated[
-        str, typer.Option("--what", help="What to calibrate: pairs, stereo, cameras, imu or all.", metavar="WHAT")
+        str,
+        typer.Option(
+            "--what",
+            help="What to calibrate: pairs, stereo, cameras, imu or all.",
+            metavar="WHAT",
+            autocompletion=completion.calibration_part,
+        ),
     ] = "pairs",
     correct_imu: Annotated[
         bool, typer.Option("--correct-imu", help="Also correct the rotation against the IMU and the time offset.")

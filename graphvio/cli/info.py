@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphvio.cli import options
+from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import check_scene
 
@@ -90,7 +90,9 @@ def _show_folder(path: Path, rig: Path | None) -> None:
 
 
 def dump_config(
-    profile: Annotated[str, typer.Argument(help="Profile or YAML file.")] = "default",
+    profile: Annotated[
+        str, typer.Argument(help="Profile or YAML file.", autocompletion=completion.profile)
+    ] = "default",
     verbose: options.Verbose = False,
 ) -> None:
     """Print all values of a configuration as YAML.

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from graphvio.cli import options
+from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.live_run import run_live
 
@@ -15,7 +15,9 @@ def live(
     source: Annotated[
         str | None,
         typer.Argument(
-            help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator; or a recording's path."
+            help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator; "
+            "or a recording's path.",
+            autocompletion=completion.live_kind,
         ),
     ] = None,
     list_devices: Annotated[bool, typer.Option("--list", help="List the connected devices, and end.")] = False,

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from graphvio.cli import completion
+
 
 def _if(is_possible: Callable[[float], bool], wanted: str) -> Callable[[float | None], float | None]:
     """Return the check of an option: a value that is not possible is refused, by a message that names the option."""
@@ -33,7 +35,12 @@ Source = Annotated[
 RigFile = Annotated[
     Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
 ]
-ConfigName = Annotated[str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")]
+ConfigName = Annotated[
+    str,
+    typer.Option(
+        "--config", help="Profile, or a YAML file with the values to change.", autocompletion=completion.profile
+    ),
+]
 Topics = Annotated[
     str | None,
     typer.Option(
@@ -63,7 +70,8 @@ SessionOut = Annotated[Path, typer.Option("--out", help="Session to write; a new
 LiveSource = Annotated[
     str,
     typer.Argument(
-        help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator; or a recording's path."
+        help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator; or a recording's path.",
+        autocompletion=completion.live_kind,
     ),
 ]
 Record = Annotated[Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")]
@@ -89,7 +97,11 @@ ReportFolder = Annotated[
 ]
 Scale = Annotated[
     str,
-    typer.Option("--scale", help="Lengths that a camera measures may be wrong by a factor: auto, estimate or fixed."),
+    typer.Option(
+        "--scale",
+        help="Lengths that a camera measures may be wrong by a factor: auto, estimate or fixed.",
+        autocompletion=completion.scale_mode,
+    ),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)]
 Times = Annotated[

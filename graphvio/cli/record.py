@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphvio.cli import options
+from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
@@ -79,7 +79,11 @@ def convert(
     ],
     file_format: Annotated[
         str | None,
-        typer.Option("--format", help="mcap, rosbag1, rosbag2 or euroc.  [default: by the name: .mcap, .bag]"),
+        typer.Option(
+            "--format",
+            help="mcap, rosbag1, rosbag2 or euroc.  [default: by the name: .mcap, .bag]",
+            autocompletion=completion.session_format,
+        ),
     ] = None,
     rig: options.RigFile = None,
     topics: options.Topics = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphvio.cli import options
+from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import framesets_bar
 
@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    name: Annotated[str, typer.Argument(help="Scene: room, corridor, stairs, loop or calibration.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Scene: room, corridor, stairs, loop or calibration.", autocompletion=completion.scene),
+    ],
     out: Annotated[Path, typer.Option("--out", help="Folder to write; new or empty.")],
     duration: Annotated[
         float | None, typer.Option("--duration", help="Seconds of the walk.  [default: all of it]")
@@ -43,6 +46,7 @@ def simulate(
             "left-right-rotation, baseline, cameras-in-body, pair-transform, time-offset, imu-scale, imu-misalignment "
             "or imu-noise.  [default: all]",
             metavar="NAME",
+            autocompletion=completion.calibration_component,
         ),
     ] = None,
     calibration_seed: Annotated[
@@ -55,6 +59,7 @@ def simulate(
             help="What happens to the true cameras on the way: thermal, a slow drift, or knock, in the middle.  "
             "[default: nothing]",
             metavar="NAME",
+            autocompletion=completion.rig_change,
         ),
     ] = None,
     rig: Annotated[
@@ -63,6 +68,7 @@ def simulate(
             "--rig",
             help="Rig file; or paper, two stereo pairs, stereo, stereo+back, headset, surround or phone.",
             metavar="RIG",
+            autocompletion=completion.named_rig,
         ),
     ] = "paper",
     verbose: options.Verbose = False,
