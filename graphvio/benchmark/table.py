@@ -118,7 +118,8 @@ class Benchmark:
     def notes(self) -> list[str]:
         """Return what must be said below the table: notes on rows, what is absent, and all sources."""
         lines = [f"{outcome.sequence}: {note}" for outcome in self.outcomes if (note := self.note(outcome))]
-        lines.append(f"graphvio: ATE, {ALIGNMENT}; times with {self.jobs} of the sequences at once")
+        load = "one sequence at a time" if self.jobs == 1 else f"{self.jobs} sequences at once"
+        lines.append(f"graphvio: ATE, {ALIGNMENT}; times with {load}")
         if self.absent:
             lines.append(f"not in the folder: {', '.join(self.absent)}")
         for each in self.published:

@@ -94,14 +94,15 @@ def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
         axes.plot(*estimate[:, [0, z]].T, color=_ESTIMATE, linewidth=1.6, label="estimate, aligned")
         _mark_ends(axes, estimate, np.empty(0, int), z)
     seconds = 1e-9 * (evaluation.stamps_ns - evaluation.stamps_ns[0])
+    rmse_m, rmse_deg = evaluation.ate_position_m.rmse, evaluation.ate_rotation_deg.rmse
     panels = (
-        (evaluation.position_error_m, evaluation.ate_position_m.rmse, "position error, m", 1),
-        (evaluation.rotation_error_deg, evaluation.ate_rotation_deg.rmse, "rotation error, degrees", 0),
+        (evaluation.position_error_m, rmse_m, _length(rmse_m), "position error, m", 1),
+        (evaluation.rotation_error_deg, rmse_deg, f"{rmse_deg:.3g}°", "rotation error, degrees", 0),
     )
-    for errors, rmse, label, row in panels:
+    for errors, rmse, text, label, row in panels:
         axes = _series_axes(figure, row)
         axes.plot(seconds, errors, color=_ESTIMATE, linewidth=1.2)
-        axes.axhline(rmse, color=_STATUS_COLOURS[Status.COASTING], linewidth=1.2, label=f"rmse {rmse:.3g}")
+        axes.axhline(rmse, color=_STATUS_COLOURS[Status.COASTING], linewidth=1.2, label=f"rmse {text}")
         axes.set(ylabel=label, xlim=(0.0, max(float(seconds[-1]), 1e-3)), ylim=(0.0, None))
         axes.legend(loc="upper right", fontsize=9, framealpha=0.9)
         axes.grid(**_GRID)
@@ -124,7 +125,7 @@ def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
     begin = min((int(each.stamps_ns[0]) for each in evaluations.values()), default=0)
     for name, each in evaluations.items():
         seconds = 1e-9 * (each.stamps_ns - begin)
-        label = f"{name}: {each.ate_position_m.rmse:.3g} m, {each.ate_rotation_deg.rmse:.3g}°"
+        label = f"{name}: {_length(each.ate_position_m.rmse)}, {each.ate_rotation_deg.rmse:.3g}°"
         panels[0].plot(seconds, each.position_error_m, linewidth=1.2, label=label)
         panels[1].plot(seconds, each.rotation_error_deg, linewidth=1.2)
     for panel, label in zip(panels, ("position error, m", "rotation error, degrees"), strict=True):
@@ -196,9 +197,12 @@ def _run_title(name: str, trajectory: Trajectory, breaks: Any, evaluation: Evalu
 
 
 def _figures(evaluation: Evaluation) -> str:
-    rmse_m, rmse_deg = evaluation.ate_position_m.rmse, evaluation.ate_rotation_deg.rmse
-    ate = f"{100.0 * rmse_m:.3g} cm" if rmse_m < 1.0 else f"{rmse_m:.2f} m"
-    return f"path {evaluation.path_length_m:.1f} m, {evaluation.duration_s:.1f} s, ATE {ate}, {rmse_deg:.2f}°"
+    ate = f"ATE {_length(evaluation.ate_position_m.rmse)}, {evaluation.ate_rotation_deg.rmse:.3g}°"
+    return f"path {evaluation.path_length_m:.1f} m, {evaluation.duration_s:.1f} s, {ate}"
+
+
+def _length(metres: float) -> str:
+    return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{metres:.3g} m"
 
 
 def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Axes, Axes]:
