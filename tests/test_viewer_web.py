@@ -22,6 +22,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.viewer import Viewer, WebOptions
 from graphvio.viewer.layout import STATUS_COLOURS
 from graphvio.viewer.web import WebHost
+from graphvio.viewer.window import window_command
 
 pytest.importorskip("rerun")
 
@@ -124,6 +125,22 @@ def test_viewer_after_end_of_web_host_still_saves(tmp_path: Path, monkeypatch: p
         for k in range(1, 20):
             viewer.show(frameset(k), estimate(k))
     assert rows_of(tmp_path / "run.rrd")["/world/rig"] == 20
+
+
+def test_window_listens_on_this_machine_only() -> None:
+    """Without a window, as there is no display; where nothing can be rendered it ends soon after."""
+    port = free_options().port
+    process = subprocess.Popen(
+        [*window_command(port), "--headless"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        until = time.monotonic() + 60.0
+        while not (hosts := listening_hosts(port)) and process.poll() is None and time.monotonic() < until:
+            time.sleep(0.005)
+    finally:
+        process.kill()
+        process.wait()
+    assert hosts == {"0100007F"}  # 127.0.0.1
 
 
 def test_web_options_with_unusable_values_raise() -> None:

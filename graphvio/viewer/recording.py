@@ -19,11 +19,6 @@ The timeline ``time`` is relative to the first stamp.
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import socket
-import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,13 +39,12 @@ from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.trajectory import Trajectory
 from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, as_entity, blueprint
 from graphvio.viewer.web import WebHost, WebOptions
+from graphvio.viewer.window import URL, open_window
 
 _MAX_SEGMENT_POSES = 100
 _SIGMAS = 3.0
 _JPEG_QUALITY = 80
 _CURVES_NS = 500_000_000
-_PORT = 9876
-_WINDOW_S, _WINDOW_SURE_S = 8.0, 1.0
 _FLUSH_S = 30.0
 _FRUSTUM_M = 0.25
 _INLIER, _OUTLIER = (60, 220, 90), (235, 60, 50)
@@ -80,9 +74,8 @@ class Recording:
         if save is not None:
             sinks.append(rr.FileSink(str(save)))
         if spawn:
-            rr.spawn(port=_PORT, connect=False, recording=self._stream, **_executable())
-            _wait_for_window()
-            sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{_PORT}/proxy"))
+            open_window()
+            sinks.append(rr.GrpcSink(URL))
         self._web = None if web is None else WebHost(web)
         if web is not None:
             sinks.append(rr.GrpcSink(web.data_url))
@@ -276,23 +269,6 @@ def ellipsoid(covariance: Float) -> tuple[Float, Float]:
 
 def _entity_of(curve: Curve) -> str:
     return f"calibration/{as_entity(curve.group)}/{as_entity(curve.name or 'value')}"
-
-
-def _executable() -> dict[str, str]:
-    """Path of rerun's program where it is next to Python in a folder that is not in PATH."""
-    program = Path(sys.executable).with_name("rerun")
-    return {} if shutil.which("rerun") or not program.is_file() else {"executable_path": str(program)}
-
-
-def _wait_for_window() -> None:
-    """Wait until rerun answers, and still does after a second: without a usable display it ends at once."""
-    start = time.monotonic()
-    while (waited := time.monotonic() - start) < _WINDOW_S:
-        time.sleep(0.1)
-        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", _PORT), timeout=1.0):
-            if waited > _WINDOW_SURE_S:
-                return
-    raise RuntimeError("rerun's window does not answer; is the display usable? --save-rrd FILE needs none")
 
 
 def _quat_xyzw(rotation: Float) -> Float:

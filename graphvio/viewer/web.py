@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 from graphvio.errors import GraphvioError
 
-_HOST = "127.0.0.1"
+HOST = "127.0.0.1"
 _START_S, _END_S = 20.0, 5.0
 # Ends the server when its standard input is closed, which also happens when this process is killed.
 _SCRIPT = 'trap : TERM; "$@" & read -r _; kill -TERM 0; wait'
@@ -52,12 +52,12 @@ class WebOptions:
     @property
     def data_url(self) -> str:
         """Address of the data."""
-        return f"rerun+http://{_HOST}:{self.data_port}/proxy"
+        return f"rerun+http://{HOST}:{self.data_port}/proxy"
 
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{_HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
+        return f"http://{HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
 
 
 class WebHost:
@@ -71,7 +71,7 @@ class WebHost:
         for port in (options.port, options.data_port):
             _check_free(port)
         command = [
-            *(*_program(), "--serve-web", "--bind", _HOST),
+            *(*rerun_program(), "--serve-web", "--bind", HOST),
             *("--port", str(options.data_port), "--web-viewer-port", str(options.port)),
             *("--server-memory-limit", f"{options.memory_mb}MB"),
         ]
@@ -103,14 +103,14 @@ class WebHost:
     def _wait_for(self, port: int) -> None:
         until = time.monotonic() + _START_S
         while time.monotonic() < until:
-            with suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
+            with suppress(OSError), socket.create_connection((HOST, port), timeout=1.0):
                 return
             time.sleep(0.05)
-        raise GraphvioError(f"web view: rerun does not serve on {_HOST}:{port}; does  rerun --serve-web  work here?")
+        raise GraphvioError(f"web view: rerun does not serve on {HOST}:{port}; does  rerun --serve-web  work here?")
 
 
-def _program() -> list[str]:
-    """Find rerun's program; its Python launcher would end before it."""
+def rerun_program() -> list[str]:
+    """Find rerun's program, as the beginning of a command; its Python launcher would end before it."""
     package = find_spec("rerun_cli")
     program = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
     return [str(program)] if program is not None and program.is_file() else [sys.executable, "-m", "rerun_cli"]
@@ -120,8 +120,8 @@ def _check_free(port: int) -> None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just closed is free
         try:
-            probe.bind((_HOST, port))
+            probe.bind((HOST, port))
         except OSError as error:
             raise GraphvioError(
-                f"web view: port {port} of {_HOST} cannot be used ({error.strerror}); choose another one"
+                f"web view: port {port} of {HOST} cannot be used ({error.strerror}); choose another one"
             ) from None
