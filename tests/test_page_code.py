@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import served
 from calibration_walks import recorded
@@ -122,6 +123,8 @@ def test_calibration(tmp_path: Path) -> None:
     for name in ("rig-calibrated.yaml", "calibration/report.html", "whole/report.html", "cameras/report.html"):
         assert (tmp_path / name).exists(), name
     assert load_rig(tmp_path / "rig-from-pairs.yaml").imu is not None
+    (pair,) = load_rig(tmp_path / "front.yaml").pairs
+    np.testing.assert_allclose(pair.right.body_T_cam[:3, 3], [0.11, 0.0, 0.0])  # right of the left one
 
 
 @pytest.mark.usefixtures("without_plots")

@@ -270,6 +270,7 @@ def test_load_rig_pair_without_baseline_or_common_view_raises(tmp_path: Path) ->
         ("rig.yaml", b"\xff\xfe\x00", "no text file"),
         ("rig.bin", b"", "no calibration file"),
         ("notes.txt", b"lens: dirty\n", "no calibration that graphvio knows"),
+        ("stereo.yml", b"%YAML:1.0\n---\nM1: 3\n", "no calibration that graphvio knows.* graphvio_rig: 2"),
     ],
 )
 def test_load_rig_unreadable_file_raises(tmp_path: Path, name: str, content: bytes, message: str) -> None:

@@ -95,4 +95,4 @@ def _imu_line(joined: Rig) -> str:
 
 
 def _vector(values: list[float] | Float) -> str:
-    return "(" + ", ".join(f"{value:.3f}" for value in values) + ")"
+    return "(" + ", ".join(f"{round(value, 3) + 0.0:.3f}" for value in values) + ")"

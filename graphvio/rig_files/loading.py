@@ -57,6 +57,11 @@ def _load(path: Path) -> Rig:
     document = read_yaml(path)
     if native.VERSION_KEY not in document.values and kalibr.camera_names(document):
         return kalibr.load(path)
+    if native.VERSION_KEY not in document.values and path.name != native.FILE_NAME:
+        raise RigError(
+            f"{path}: holds no calibration that graphvio knows; give one of: {_FORMATS}; a rig.yaml begins with  "
+            f"{native.VERSION_KEY}: {native.VERSIONS[-1]}"
+        )
     return native.load(path)
 
 

@@ -213,7 +213,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def _number(value: float) -> str:
-    text = repr(float(value))  # the shortest text that reads back exactly
+    text = repr(float(value) + 0.0)  # the shortest text that reads back exactly; -0.0 is 0.0
     if "e" in text and "." not in text:
         text = text.replace("e", ".0e")  # YAML 1.1 reads 1e-05 as a string
     return text
