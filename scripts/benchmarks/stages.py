@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
     report.table(["stage", "median", "p99", "mean"], rows)
     report.write(args, "stages")
     if args.docs:
-        draw(IMAGES / "stages.png", times)
+        draw(IMAGES / "stage-times.png", times)
 
 
 def _times_ms(footage: Footage, config: Config) -> dict[str, list[float]]:
