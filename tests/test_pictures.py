@@ -25,3 +25,11 @@ def test_animation_is_of_the_whole_walk_and_small() -> None:
     assert frames[0] != frames[30] != frames[59]
     assert (IMAGES / ANIMATION_NAME).stat().st_size < 6e5
     assert f"images/{ANIMATION_NAME}" in README + (DOCS / "index.md").read_text()
+
+
+def test_each_picture_is_made_by_one_script() -> None:
+    """Two that wrote one name put a benchmark's picture where a page explains the stages."""
+    texts = {script: script.read_text() for script in (DOCS.parent / "scripts").rglob("*.py")}
+    for picture in IMAGES.iterdir():
+        makers = [script.name for script, text in texts.items() if picture.name in text]
+        assert len(makers) == 1, f"{picture.name}: {makers}"
