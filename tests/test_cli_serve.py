@@ -46,7 +46,7 @@ def printed(process: subprocess.Popen[str], start: str) -> str:
 
 
 def test_serve_sends_keyframes_and_takes_a_correction(room_walk: Path) -> None:
-    process = serve(room_walk, "--port", 0)
+    process = serve(f"{room_walk}?speed=2", "--port", 0)
     try:
         with Client(address_of(process)) as client:
             map_T_odom = np.eye(4)
@@ -68,7 +68,7 @@ def test_serve_sends_keyframes_and_takes_a_correction(room_walk: Path) -> None:
 
 
 def test_serve_slow_reader_gets_the_last_keyframe(room_walk: Path) -> None:
-    process = serve(f"replay:{room_walk}", "--port", 0)
+    process = serve(f"replay:{room_walk}?speed=2", "--port", 0)
     try:
         with Client(address_of(process), patience_s=0.0) as client:
             stream = client.keyframes(with_images=True)
@@ -84,7 +84,7 @@ def test_serve_slow_reader_gets_the_last_keyframe(room_walk: Path) -> None:
 
 
 def test_serve_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
-    process = serve(f"replay:{room_walk}", "--port", 0)
+    process = serve(f"replay:{room_walk}?speed=2", "--port", 0)
     try:
         with Client(address_of(process), patience_s=0.0) as client:
             stream = client.keyframes(with_images=True)

@@ -81,7 +81,7 @@ def topics_of(display: Any) -> list[str]:
     return [display["Topic"]["Value"]] if "Topic" in display else []
 
 
-def test_node_publishes_what_rviz_shows(room_walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_node_publishes_what_rviz_shows(long_room_walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the arguments that ROS gives it; a recording is its source."""
     rviz = yaml.safe_load((PACKAGE / "rviz/graphvio.rviz").read_text())["Visualization Manager"]
     wanted = {topic for display in rviz["Displays"] for topic in topics_of(display)}
@@ -90,7 +90,7 @@ def test_node_publishes_what_rviz_shows(room_walk: Path, monkeypatch: pytest.Mon
     domain = free_domain()
     process = subprocess.Popen(
         [sys.executable, "-m", "graphvio_ros.node", "--ros-args", "-r", "__node:=graphvio", "-r", "__ns:=/",
-         "--params-file", str(PACKAGE / "config/graphvio.yaml"), "-p", f"source:=replay:{room_walk}?speed=0.1",
+         "--params-file", str(PACKAGE / "config/graphvio.yaml"), "-p", f"source:=replay:{long_room_walk}?speed=0.2",
          "-p", "frames.base_T_imu:=[0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0]"],
         env={**os.environ, "PYTHONPATH": str(PACKAGE), "ROS_DOMAIN_ID": str(domain)},
         stderr=subprocess.PIPE,

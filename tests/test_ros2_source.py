@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -245,22 +246,30 @@ def rig_of_other_names() -> Rig:
 
 
 def test_open_missing_topics_are_named(domain: int, robot: Other) -> None:
+    """All at once: each waits for what does not come."""
     rig = small_rig()
     absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=1.5", rig)
-    with pytest.raises(SourceError, match=r"no publisher of /front/image_raw; start it.*Topics on domain .*: .*/imu"):
-        absent.open()
     of_another_type = open_live_source(f"ros2:?domain={domain}&cam0=/imu", rig)
-    with pytest.raises(SourceError, match=r"/imu: has messages of type sensor_msgs/msg/Imu"):
-        of_another_type.open()
     reliable = open_live_source(f"ros2:?domain={domain}&reliable=1", rig)
-    with pytest.raises(SourceError, match="best effort"):
-        reliable.open()
     nameless = open_live_source(f"ros2:?domain={domain}&wait_s=1.5", rig_of_other_names())
-    with pytest.raises(SourceError, match=r"images of north; give north=/TOPIC\. Topics with images: /pair0/left"):
-        nameless.open()
     no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=1.5")
-    with pytest.raises(RigError, match="no stereo pair has images and camera_info"):
-        no_pair.open()
+    sources = (absent, of_another_type, reliable, nameless, no_pair)
+    with ThreadPoolExecutor(len(sources)) as threads:
+        opened = [threads.submit(source.open) for source in sources]
+    for future, kind, message in zip(
+        opened,
+        (SourceError, SourceError, SourceError, SourceError, RigError),
+        (
+            r"no publisher of /front/image_raw; start it.*Topics on domain .*: .*/imu",
+            r"/imu: has messages of type sensor_msgs/msg/Imu",
+            "best effort",
+            r"images of north; give north=/TOPIC\. Topics with images: /pair0/left",
+            "no stereo pair has images and camera_info",
+        ),
+        strict=True,
+    ):
+        with pytest.raises(kind, match=message):
+            future.result()
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import grpc
 
 from graphvio.slam.client import Client
 from graphvio.slam.service import messages
+from graphvio.slam.service import server as service
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 
@@ -152,6 +153,14 @@ def test_silent_connections_do_not_keep_others_out(server: GrpcServer) -> None:
         connection.close()
 
 
+@pytest.fixture
+def short_handshake(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A silent connection is closed after a fifth of the usual time."""
+    assert service._HANDSHAKE_MS == 5_000
+    monkeypatch.setattr(service, "_HANDSHAKE_MS", 1_000)
+
+
+@pytest.mark.usefixtures("short_handshake")  # the server comes after it
 def test_idle_connections_are_closed_within_seconds(server: GrpcServer) -> None:
     port = int(server.address.rpartition(":")[2])
     silent = [socket.create_connection(("127.0.0.1", port), timeout=5.0) for _ in range(150)]

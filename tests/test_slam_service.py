@@ -485,7 +485,10 @@ def test_waiting_estimates_reach_a_slow_reader_after_the_end(odometry: served.Sy
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGSTOP")
-def test_stalled_reader_does_not_delay_the_end(odometry: served.SyntheticOdometry) -> None:
+def test_stalled_reader_does_not_delay_the_end(
+    odometry: served.SyntheticOdometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("graphvio.slam.service.server._STALLED_S", 1.0)
     for number in range(200):
         odometry.keyframe_log.add(served.keyframe(number))
     server = GrpcServer(odometry, replace(ANY_PORT, keepalive_s=3600.0))
