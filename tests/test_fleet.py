@@ -85,13 +85,13 @@ def config(folder: Path) -> Config:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with local_cluster() as made:
+    with local_cluster("extracting_here.py") as made:
         yield made
 
 
-def local_cluster() -> Any:
+def local_cluster(*preloads: str) -> Any:
     """Two workers, whose short runs would mostly plot."""
-    preload = [str(Path(__file__).with_name("undrawn.py"))]
+    preload = [str(Path(__file__).with_name(name)) for name in ("undrawn.py", *preloads)]
     return LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", preload=preload
     )
