@@ -68,12 +68,14 @@ def test_live_begins_with_what_the_last_run_of_the_device_learnt(vga_walk: Path,
     after = calibration_differences(load_rig(memory), true)
     assert np.linalg.norm(after["left_right_deg"]) < 0.5 * np.linalg.norm(before["left_right_deg"])
 
-    assert LEARNT not in live(simulator, "--rig", rig, "--forget-calibration")
-
-    other = live(simulator, "--rig", wrong(tmp_path / "other.yaml", true, 1))
+    other_rig = wrong(tmp_path / "other.yaml", true, 1)
+    other = live(simulator, "--rig", other_rig)
     assert OTHER in other
     assert LEARNT not in other
     assert [path.name for path in folder.iterdir()] != [memory.name]  # of the newest rig file only
+
+    assert LEARNT in live(f"{simulator}&duration_s=1", "--rig", other_rig)
+    assert LEARNT not in live(f"{simulator}&duration_s=1", "--rig", other_rig, "--forget-calibration")
 
 
 def test_live_keeps_nothing_of_recordings_and_where_the_calibration_is_not_estimated(
