@@ -52,7 +52,7 @@ class WindowCalibration:
         self._evidence = Evidence.none(len(self._rows))
         self._bias_walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
-        self.factors = self.exact_factors
+        self.factors = self._first_factors = self.exact_factors
         self.log_bayes_factor = 0.0
 
     @property
@@ -100,6 +100,10 @@ class WindowCalibration:
             walk[n:, n:] = self._walk
         return np.asarray(np.sqrt(seconds) * walk)
 
+    def begin(self, factors: Float) -> None:
+        """Begin with a window that is adjusted with some factors (G,)."""
+        self.factors = self._first_factors = factors
+
     def update(self, evidence: Evidence) -> bool:
         """Take what the window and what left it say of the calibration.
 
@@ -109,7 +113,9 @@ class WindowCalibration:
         before, self._evidence = self.factors, evidence
         found, self.log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
         if not self.is_file_exact or (found != EXACT).any():
-            self.factors = np.maximum(found, _MIN_FACTOR)
+            # Errors that the tracks of one camera have in common look like those of a lens: it is not as wrong as any.
+            of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
+            self.factors = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
         return not np.array_equal(self.factors, before)
 
     def estimate(self, difference: Float, biases: Float, bias_covariance: Float) -> CalibrationEstimate:

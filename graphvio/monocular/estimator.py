@@ -316,7 +316,7 @@ class MonocularEstimator:
         """Begin with a window whose scale is known."""
         self._window, self._is_keyframe, self._before, self._first_pose_ns = window, True, None, stamp_ns
         if self._calibration is not None:
-            self._calibration.factors = window.factors
+            self._calibration.begin(window.factors)
         self.initialisations += 1
         self._report(
             stamp_ns,

@@ -24,6 +24,7 @@ from graphvio.self_calibration.parameters import (
     relative_to_first,
     single_cameras,
 )
+from graphvio.self_calibration.prior import SINGLE_CENTRE_PX, SINGLE_FOCAL_SHARE
 
 _FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard deviations
 _OBSERVED = 0.5  # of the prior's standard deviation
@@ -122,7 +123,7 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
     for j, pair in enumerate(rig.pairs):
         at = j * PAIR
         for which, camera in enumerate(pair.cameras):
-            yield from _of_lens(camera, whole[at + which * CAMERA :])
+            yield from _of_lens(camera, whole[at + which * CAMERA :], 0.05, 0.3)
         stereo, body = at + STEREO, at + BODY
         name = f"pair {pair.name}"
         yield f"{name}, rotation left to right", "deg", deg, whole[stereo : stereo + 3], 0.005, _DEPTHS
@@ -132,7 +133,7 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
             yield f"{name}, rotation against {rig.pairs[0].name}", "deg", deg, relative[:3], 0.03, _TURN
             yield f"{name}, translation against {rig.pairs[0].name}", "mm", 1e3, relative[3:], 3.0, _TURN
     for j, camera in enumerate(single_cameras(rig)):
-        yield from _of_lens(camera, whole[j * SINGLE :])
+        yield from _of_lens(camera, whole[j * SINGLE :], 100.0 * SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX)
         if j > 0:
             name, first = f"camera {camera.name}", rig.singles[0].name
             relative = relative_to_first(rig, j) @ whole[: n_of_cameras(rig)]
@@ -148,8 +149,10 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
     yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION
 
 
-def _of_lens(camera: Camera, rows: Float) -> Iterator[tuple[str, str, float, Float, float, str]]:
-    """Yield the parts of a lens, whose parameters are the first ones of some rows (N, C)."""
+def _of_lens(
+    camera: Camera, rows: Float, focal_percent: float, centre_px: float
+) -> Iterator[tuple[str, str, float, Float, float, str]]:
+    """Yield the parts of a lens, whose parameters come first in some rows (N, C), with their smallest errors."""
     focal = 100.0 / float(camera.intrinsics[:2].mean())
-    yield f"{camera.name}, focal lengths", "%", focal, rows[:2], 0.05, _DEPTHS
-    yield f"{camera.name}, principal point", "px", 1.0, rows[2:INTRINSICS], 0.3, _DEPTHS
+    yield f"{camera.name}, focal lengths", "%", focal, rows[:2], focal_percent, _DEPTHS
+    yield f"{camera.name}, principal point", "px", 1.0, rows[2:INTRINSICS], centre_px, _DEPTHS

@@ -34,6 +34,8 @@ from graphvio.self_calibration.parameters import (
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
 _MIN_SIGMA = 1e-9
 _GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.05, 0.3
+SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX = 0.002, 1.0
+"""Errors of a single camera's lens that no covariance has: its tracks in real images have errors in common."""
 _BIAS_WALK_FACTOR = 2.0  # on the stated random walks, which are those of a sensor at one temperature
 
 
@@ -115,12 +117,19 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
         of_stereo = [(pair, sigmas[STEREO:BODY]) for pair, sigmas in zip(rig.pairs, of_group, strict=True)]
         stereo_deg = float(np.rad2deg(max(sigmas[:3].max() for _, sigmas in of_stereo)))
         baseline_share = max(float(sigmas[3:].max()) / pair.baseline_m for pair, sigmas in of_stereo)
+    focal_share = max(float((sigmas[:2] / camera.intrinsics[:2]).max()) for camera, sigmas in cameras)
+    centre_px = max(float(sigmas[2:INTRINSICS].max()) for _, sigmas in cameras)
+    if not rig.pairs:
+        focal_share, centre_px = (
+            float(np.hypot(focal_share, SINGLE_FOCAL_SHARE)),
+            float(np.hypot(centre_px, SINGLE_CENTRE_PX)),
+        )
     imu = _sigmas(covariance, slice(-PARAMETERS, None)) if rig.imu is not None else _sigmas_of_imu(known)
     matrix = imu[GYRO_MATRIX:TIME_OFFSET].reshape(2, 3, 3)
     diagonal = np.diagonal(matrix, axis1=1, axis2=2)
     return CalibrationSigmas(
-        focal_share=max(float((sigmas[:2] / camera.intrinsics[:2]).max()) for camera, sigmas in cameras),
-        principal_point_px=max(float(sigmas[2:INTRINSICS].max()) for _, sigmas in cameras),
+        focal_share=focal_share,
+        principal_point_px=centre_px,
         distortion_share=known.distortion_share,
         stereo_rotation_deg=stereo_deg,
         stereo_baseline_share=baseline_share,
