@@ -3,7 +3,8 @@
 No object of the library changes the process that it runs in. The command line makes the settings of this module; a
 program that embeds graphvio makes those that suit it:
 
-- `use_one_opencv_thread`, since pairs are tracked in threads of their own, with which OpenCV's would compete;
+- `set_up_threads`, since pairs are tracked in threads of their own, with which OpenCV's would compete, and which would
+  wait for each other for milliseconds;
 - `share_heap` before threads are started, where images pass through many threads for hours;
 - `interruptible` around calls that Ctrl-C should end, even while compiled code runs;
 - `StopSignals`, `HeldInterrupt`, `on_interrupt` and the functions below them, for loops that must end cleanly.
@@ -26,16 +27,21 @@ from typing import Any, Self
 from graphvio.errors import MissingExtraError
 
 _M_ARENA_MAX = -8  # of glibc's malloc.h
+_SWITCH_INTERVAL_S = 0.0005
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # ---------------------------------------------------------------------- threads and memory
 
 
-def use_one_opencv_thread() -> None:
-    """Switch off OpenCV's own threads in this process."""
+def set_up_threads() -> None:
+    """Switch off OpenCV's own threads in this process, and let Python's take turns every half millisecond.
+
+    By default a thread that waits for the interpreter gets it after 5 ms, which is most of a frameset's time.
+    """
     import cv2
 
     cv2.setNumThreads(1)
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
 
 
 def share_heap() -> bool:

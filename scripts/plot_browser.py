@@ -16,7 +16,7 @@ from browser import CHROMIUM, Browser, free_options  # noqa: E402
 from graphvio import Config, open_source  # noqa: E402
 from graphvio.pipeline import RunListener, run  # noqa: E402
 from graphvio.results import ResultWriter  # noqa: E402
-from graphvio.runtime import use_one_opencv_thread  # noqa: E402
+from graphvio.runtime import set_up_threads  # noqa: E402
 from graphvio.simulation import simulate  # noqa: E402
 from graphvio.viewer import Viewer  # noqa: E402
 
@@ -28,7 +28,7 @@ def main(picture: Path) -> int:
     if CHROMIUM is None:
         print("no Chromium is installed (Debian: chromium)", file=sys.stderr)
         return 2
-    use_one_opencv_thread()
+    set_up_threads()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         simulate("room", folder / "room", duration_s=SECONDS)

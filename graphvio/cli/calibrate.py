@@ -84,7 +84,7 @@ def calibrate(
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
     from graphvio.rig_files import save_rig
-    from graphvio.runtime import use_one_opencv_thread
+    from graphvio.runtime import set_up_threads
 
     _check_outputs(out, report, [] if rig is None else [rig])
     is_of_pairs = _is_of_pairs(what, {"--correct-imu": correct_imu, "--guide": guide, "--scale": scale != "auto"})
@@ -97,7 +97,7 @@ def calibrate(
     if correct_imu and (out is None or opened.rig.imu is None):
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
-    use_one_opencv_thread()
+    set_up_threads()
     warm_up_visibly(opened.rig.with_pairs([0]).without_imu(), settings)
     names = [pair.name for pair in opened.rig.pairs]
     with CalibrationProgress(opened.frameset_count, names if guide else None) as progress:

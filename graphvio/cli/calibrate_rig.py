@@ -25,9 +25,9 @@ def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None,
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.odometry.recorded_calibration import calibrate_recording
     from graphvio.rig_files import save_rig
-    from graphvio.runtime import interruptible, use_one_opencv_thread
+    from graphvio.runtime import interruptible, set_up_threads
 
-    use_one_opencv_thread()
+    set_up_threads()
     warm_up_visibly(opened.rig, settings)
     try:
         with interruptible(), stage_bars() as bars:

@@ -46,7 +46,7 @@ def run_live(
     from graphvio.live.outputs import ViewOutput
     from graphvio.live.running import LiveOdometry
     from graphvio.live.session_recorder import SessionRecorder
-    from graphvio.runtime import StopSignals, share_heap, sigterm_as_interrupt, use_one_opencv_thread
+    from graphvio.runtime import StopSignals, set_up_threads, share_heap, sigterm_as_interrupt
 
     if png and record is None:
         raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
@@ -67,7 +67,7 @@ def run_live(
             memory = _memory(source, opened.name, used, settings, forget_calibration)
             if memory is not None:
                 used = _remembered(memory, used)
-            use_one_opencv_thread()
+            set_up_threads()
             warm_up_visibly(used, settings)  # measurements that come meanwhile are not used
         signals = stack.enter_context(StopSignals())
         recording = stack.enter_context(ExitStack())  # closed after the run, so that it is complete

@@ -81,7 +81,7 @@ def optimize(
     from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.results import ResultWriter
-    from graphvio.runtime import interruptible, use_one_opencv_thread
+    from graphvio.runtime import interruptible, set_up_threads
 
     if not no_loops:
         colmap()  # before hours of work, not after
@@ -106,7 +106,7 @@ def optimize(
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")
-    use_one_opencv_thread()
+    set_up_threads()
     for source in opened:
         warm_up_visibly(source.rig, settings)
     try:

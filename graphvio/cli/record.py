@@ -52,13 +52,13 @@ def record(
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.odometry import Odometry
-    from graphvio.runtime import use_one_opencv_thread
+    from graphvio.runtime import set_up_threads
     from graphvio.sessions.writer import SessionWriter
 
     check_session_name(out)
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
-    use_one_opencv_thread()
+    set_up_threads()
     warm_up_visibly(opened.rig, settings)
     writer = SessionWriter(out, opened.rig, "png" if png else "raw")
     truth = _truth(opened, is_whole=from_s is None and to_s is None)

@@ -67,7 +67,7 @@ def run(
     from graphvio.pipeline import RunListener
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
-    from graphvio.runtime import interruptible, use_one_opencv_thread
+    from graphvio.runtime import interruptible, set_up_threads
     from graphvio.viewer import Viewer
 
     settings = Config.load(config)
@@ -84,7 +84,7 @@ def run(
             listeners.append(
                 RunListener(on_estimate=viewer.show, on_event=viewer.show_event, on_calibration=viewer.show_calibration)
             )
-        use_one_opencv_thread()
+        set_up_threads()
         warm_up_visibly(opened.rig, settings, wait_for_calibration=False)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
         try:

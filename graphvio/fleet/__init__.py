@@ -2,7 +2,7 @@
 
 import logging
 
-from graphvio.runtime import ignore_interrupts, use_one_opencv_thread
+from graphvio.runtime import ignore_interrupts, set_up_threads
 
 
 def dask_setup(worker: object) -> None:
@@ -11,5 +11,5 @@ def dask_setup(worker: object) -> None:
     Interrupts are left to the process that started the workers, and warnings on recordings to the results.
     """
     ignore_interrupts()
-    use_one_opencv_thread()
+    set_up_threads()
     logging.getLogger("graphvio").setLevel(logging.ERROR)

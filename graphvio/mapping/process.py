@@ -16,7 +16,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError, MapError, ServiceError
 from graphvio.mapping.mapper import Mapper
 from graphvio.optimization.loops.colmap_library import colmap
-from graphvio.runtime import ignore_stop_signals, use_one_opencv_thread
+from graphvio.runtime import ignore_stop_signals, set_up_threads
 from graphvio.slam.client import Client
 from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
@@ -53,7 +53,7 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
     """
     colmap()  # installs its own handler of SIGTERM when it is loaded
     ignore_stop_signals()  # they are for the odometry, with which this process ends
-    use_one_opencv_thread()
+    set_up_threads()
     with Client(task.address) as client, Mapper(ClientWithImages(client), task.config, task.map, task.folder) as mapper:
         warm_up(client.rig, task.config)
         try:

@@ -13,7 +13,7 @@ from graphvio.arrays import Float
 from graphvio.linear_algebra import cholesky
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.parameters import n_of_cameras
 from graphvio.self_calibration.prior import file_prior
@@ -83,9 +83,9 @@ class WindowCalibration:
             return None
         return np.asarray(np.linalg.inv(self._prior.with_factors(factors)))
 
-    def is_plausible(self, difference: Float, factors: Float) -> bool:
-        """Return whether a difference (F,) is within four standard deviations of a file that is wrong by factors."""
-        sigmas = self._prior.of_each(factors) * np.sqrt(np.diag(self._prior.covariance))
+    def is_plausible(self, difference: Float) -> bool:
+        """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any."""
+        sigmas = MAX_FACTOR * np.sqrt(np.diag(self._prior.covariance))
         return bool((np.abs(difference) <= _MAX_SIGMAS * sigmas).all())
 
     def walk(self, seconds: float) -> Float:

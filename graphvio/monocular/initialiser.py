@@ -205,7 +205,7 @@ class Initialiser:
             return "images and IMU contradict each other"
         if abs(float(np.linalg.norm(states.gravity)) - GRAVITY_M_S2) > _MAX_GRAVITY_EXCESS:
             return "images and IMU contradict each other about gravity"
-        if states.calibration.any() and not self._is_plausible(states, factors):
+        if states.calibration.any() and not self._is_plausible(states):
             return "images and IMU contradict each other, whatever the calibration"
         self._fits_no_motion = False
         self.scale_sigma = sigma = scale_sigma(states, at.hessian)
@@ -213,11 +213,11 @@ class Initialiser:
             return f"the scale is known to {100 * sigma:.0f} % only"
         return ""
 
-    def _is_plausible(self, states: States, factors: Float) -> bool:
+    def _is_plausible(self, states: States) -> bool:
         """Return whether calibration and biases are such as sensors have."""
         of_accel = np.abs(states.biases[3:]) <= _MAX_SIGMAS * ACCEL_BIAS_SIGMA
         calibration = self._calibration
-        return bool(of_accel.all()) and (calibration is None or calibration.is_plausible(states.calibration, factors))
+        return bool(of_accel.all()) and (calibration is None or calibration.is_plausible(states.calibration))
 
     def _in_nav(self, window: Window) -> Window:
         """Turn a window level: its first pose has heading zero, and is the origin."""

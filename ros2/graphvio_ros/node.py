@@ -21,7 +21,7 @@ from graphvio.ros2.frames import Frames
 from graphvio.ros2.node import domain_of
 from graphvio.ros2.parameters import Value, flatten
 from graphvio.ros2.publisher import Publisher
-from graphvio.runtime import StopSignals, share_heap, sigterm_as_interrupt, use_one_opencv_thread
+from graphvio.runtime import StopSignals, set_up_threads, share_heap, sigterm_as_interrupt
 from graphvio.warmup import warm_up
 from graphvio_ros.arguments import NodeArguments, parse
 
@@ -60,7 +60,7 @@ def run(arguments: NodeArguments) -> None:
         raise ConfigError("source: is empty; give a live source, such as -p source:=ros2: or source:=realsense")
     settings, domain = Config.load(str(values["config"])), domain_of(None)
     share_heap()
-    use_one_opencv_thread()
+    set_up_threads()
     source = open_live_source(str(values["source"]), load_rig(str(values["rig"])) if values["rig"] else None)
     with ExitStack() as stack:
         stack.callback(source.close)

@@ -26,7 +26,7 @@ def main() -> None:
     from graphvio.odometry import Odometry
     from graphvio.pipeline import run  # noqa: F401 - the command imports it
     from graphvio.results import ResultWriter  # noqa: F401
-    from graphvio.runtime import use_one_opencv_thread
+    from graphvio.runtime import set_up_threads
     from graphvio.warmup import warm_up
 
     lap("import")
@@ -36,7 +36,7 @@ def main() -> None:
         Path(path), None, config, pairs=pairs, no_imu=imu == "no", from_s=None, to_s=None, topics=None
     )  # fmt: skip
     lap("open")
-    use_one_opencv_thread()
+    set_up_threads()
     warm_up(recording.rig, config, wait_for_calibration=False)
     lap("kernels")
     odometry = Odometry(recording.rig, config)

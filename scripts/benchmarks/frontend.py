@@ -29,6 +29,7 @@ from benchmarks.timing import (
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.rig import Rig
+from graphvio.runtime import set_up_threads
 from graphvio.warmup import warm_up
 
 AIM = 0.35
@@ -76,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure and report."""
     if min(args.framesets, args.growth_framesets) < _MIN_FRAMESETS or args.rounds < 1:
         raise GraphvioError(f"percentiles need framesets: give {_MIN_FRAMESETS} or more, and at least one round")
+    set_up_threads()  # as commands do; each contender then sets its number of OpenCV's threads
     config = Config.load(args.profile)
     count = WARM_UP + args.framesets
     longest = count if args.no_growth else max(count, WARM_UP + args.growth_framesets)
