@@ -27,6 +27,7 @@ from graphvio.config import Config
 from graphvio.frontend.alignment import learn_from_nothing
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
+from graphvio.frontend.prediction import inverse_depths_around
 from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.singles import SinglesFrontend
@@ -58,7 +59,7 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
         wait_for_calibration: whether the kernels of the self-calibration are waited for too where they have to be
             compiled; else the self-calibration waits for them when it has seen enough.
     """
-    if not rig.pairs:  # whose calibration is not estimated
+    if not rig.pairs:  # whose calibration the window estimates, by its own kernels
         config = replace(config, calibration=replace(config.calibration, online=False))
     if not _are_compiled(config):
         _compile_in_parallel(rig, config)
@@ -116,6 +117,10 @@ def _track_singles(rig: Rig, config: Config, rng: np.random.Generator) -> None:
         images = [rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in rig.cameras]
         frontend.process(FrameSet(stamp_ns, {j: (image,) for j, image in enumerate(images)}), lambda _: np.eye(4))
     frontend.close()
+    lens, one = rig.cameras[0], np.ones((5, 1, 2))
+    inverse_depths_around(
+        one, one[0, :, 0], one[0], 1.0, np.eye(4), lens.model_number, lens.intrinsics, lens.distortion
+    )  # fmt: skip
 
 
 def _warm_up_tracking(rig: Rig, config: Config) -> None:

@@ -69,6 +69,34 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
         assert compiled() - before == set()
 
 
+def test_no_kernel_of_single_cameras_is_compiled_after_the_warm_up(room_walk: Path) -> None:
+    """In a process of its own, which has not run anything else; the walk lasts until the calibration is estimated."""
+    ran = subprocess.run(
+        [sys.executable, "-c", _RUN_SINGLES, str(room_walk)], capture_output=True, text=True, cwd=Path(__file__).parent
+    )
+    assert ran.returncode == 0, ran.stderr
+
+
+_RUN_SINGLES = """
+import sys
+from test_warmup import compiled
+from graphvio import Odometry, open_source
+from graphvio.config import Config
+from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.warmup import warm_up
+
+source = open_source(sys.argv[1])
+rig = draw(source.rig, CalibrationError.of_level(3, ["pair-transform"]), 1).written_rig.without_pairs()
+warm_up(rig, Config())
+before = compiled()
+odometry = Odometry(rig)
+for measurement in open_source(sys.argv[1], rig):
+    odometry.process(measurement)
+assert odometry.calibration is not None and not odometry.calibration.is_file_exact
+assert compiled() == before, compiled() - before
+"""
+
+
 def test_other_process_compiles_motion_and_calibration() -> None:
     done = subprocess.run(
         [sys.executable, "-c", graphvio.warmup._OTHER_PROCESS],

@@ -17,6 +17,7 @@ from graphvio.backend.initialisation import initial_attitude
 from graphvio.backend.states import RigState, StateCovariance, level_gravity, tilt_covariance
 from graphvio.config import Config
 from graphvio.geometry import se3, se3_inverse
+from graphvio.linear_algebra import solve_rows
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
@@ -55,7 +56,10 @@ from graphvio.monocular.sightings import far_off
 from graphvio.monocular.structure import Cameras, Structure, located
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.preintegration import preintegrate
+from graphvio.self_calibration.prior import file_prior
 
 _FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
@@ -524,7 +528,7 @@ class MonocularEstimator:
 
 
 def adjust_no_keyframes(rig: Rig) -> None:
-    """Call the kernels of the adjustment on a window without landmarks, so that they are compiled or loaded."""
+    """Call the kernels of the window, and of its calibration, without landmarks: they are then compiled or loaded."""
     second = 1_000_000_000
     stamps = np.arange(-second // 10, second, 5_000_000)
     readings = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2], (len(stamps), 1))
@@ -539,3 +543,7 @@ def adjust_no_keyframes(rig: Rig) -> None:
     places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
     adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)
     covariance_of(np.eye(6), np.arange(6))
+    preintegrate(*samples[:2], 0, second // 10, np.zeros(PARAMETERS), samples.noise_densities, samples.max_gap_ns)
+    file_prior(rig)
+    for part in (np.eye(6), np.eye(9)[:6, :6]):  # whole, and a part of a larger matrix
+        solve_rows(part, np.zeros((3, 6)))
