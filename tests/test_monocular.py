@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +52,7 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, is_linear, moved_cameras
 from graphvio.self_calibration.prior import file_prior
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
 from graphvio.simulation.named_rigs import stereo_and_back
 from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
@@ -715,6 +716,46 @@ def test_run_without_pairs_estimates_in_metres(walk: Path, tmp_path: Path) -> No
     assert ran.returncode == 0, ran.stderr
     error_mm = float(ran.stdout.partition("ATE rmse ")[2].partition(" mm")[0])
     assert error_mm < 2.0
+
+
+def test_run_without_pairs_by_a_wrong_file_writes_what_it_learnt_and_the_next_run_is_better(
+    walk: Path, tmp_path: Path
+) -> None:
+    true = load_rig(walk)
+    error = CalibrationError.of_level(3, ["principal-point", "pair-transform", "cameras-in-body"])
+    save_rig(draw(true, error, 1).written_rig, tmp_path / "wrong.yaml")
+    errors_mm = []
+    for rig, out in (("wrong.yaml", "first"), ("first/rig-refined.yaml", "second")):
+        ran = graphvio("run", walk, "--no-pairs", "--rig", tmp_path / rig, "--out", tmp_path / out, "--json")
+        assert ran.returncode == 0, ran.stderr
+        summary = json.loads(ran.stdout)
+        errors_mm.append(1e3 * summary["evaluation"]["ate_position_m"]["rmse"])
+        assert summary["calibration"] == json.loads((tmp_path / out / "summary.json").read_text())["calibration"]
+        if out == "first":
+            assert summary["calibration"][0].startswith("calibration corrected: ")
+            assert "camera cam2, rotation against cam0" in summary["calibration"][0]
+            assert f"corrected for this run; {tmp_path / out / 'rig-refined.yaml'} has it" in ran.stderr
+            assert "graphvio calibrate" not in ran.stderr
+    assert errors_mm[1] < errors_mm[0]
+    found = [load_rig(tmp_path / name).without_pairs() for name in ("wrong.yaml", "first/rig-refined.yaml")]
+    before, after = (calibration_differences(rig, true.without_pairs()) for rig in found)
+    for name in ("principal_point_px", "pair_transform_deg", "cameras_in_body_deg"):
+        assert np.linalg.norm(after[name]) < 0.3 * np.linalg.norm(before[name]), name
+    rows = (tmp_path / "first/calibration.csv").read_text().splitlines()
+    assert {row.split(",")[1].partition(".")[0] for row in rows[1:]} >= {"cam0", "cam1", "cam2", "imu"}
+    assert (tmp_path / "first/calibration.png").stat().st_size > 0
+    shown = graphvio("rig", tmp_path / "first/rig-refined.yaml")
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.count("single camera") == 3
+
+
+def test_run_of_one_camera_with_calibration_off_takes_the_file_as_it_is(walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "off.yaml").write_text("calibration: {online: false}\n")
+    options = ("--cameras", "0", "--to", "4", "--config", tmp_path / "off.yaml")
+    ran = graphvio("run", walk, *options, "--out", tmp_path / "out", "--json")
+    assert ran.returncode in (0, 3), ran.stderr
+    assert json.loads(ran.stdout)["calibration"] == []
+    assert not (tmp_path / "out/rig-refined.yaml").exists()
 
 
 def test_live_without_pairs_equals_the_odometry_and_serves_keyframes(walk: Path, tmp_path: Path) -> None:

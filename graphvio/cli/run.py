@@ -21,6 +21,7 @@ from graphvio.cli.shared import (
 if TYPE_CHECKING:
     from graphvio.pipeline import Progress
     from graphvio.results import Summary
+    from graphvio.rig import Rig
 
 _DOUBTFUL = ("vision_failed", "vision_weak", "vision_gated")
 _MAX_DOUBTFUL_SHARE = 0.3  # of all framesets
@@ -94,7 +95,7 @@ def run(
             warn(f"interrupted; what was estimated until then is in {folder}")
             raise typer.Exit(EXIT_INTERRUPTED) from None
     publish(asdict(summary) | {"results": str(folder)})
-    _print_summary(summary, folder)
+    _print_summary(summary, folder, opened.rig)
     if summary.completion < MIN_COMPLETION:
         warn(
             f"only {100 * summary.completion:.0f} % of the framesets have a pose; "
@@ -132,8 +133,9 @@ class _ProgressLine(TerminalDisplay):
             self._print(text)
 
 
-def _print_summary(summary: Summary, folder: Path) -> None:
+def _print_summary(summary: Summary, folder: Path, rig: Rig) -> None:
     evaluation = summary.evaluation
+    remedy = "graphvio calibrate --what all finds by how much" if rig.pairs else f"{folder / 'rig-refined.yaml'} has it"
     typer.echo(
         f"{summary.estimated} of {summary.framesets} framesets estimated, {summary.path_length_m:.2f} m in "
         f"{summary.duration_s:.1f} s, {summary.realtime_factor:.2f} x real time"
@@ -150,7 +152,7 @@ def _print_summary(summary: Summary, folder: Path) -> None:
     for sentence in summary.calibration:
         typer.echo(sentence)
     for warning in summary.warnings:
-        warn(f"{warning}; graphvio calibrate --what all finds by how much")
+        warn(f"{warning}; {remedy}")
     doubtful = sum(summary.events.get(kind, 0) for kind in _DOUBTFUL)
     if doubtful > _MAX_DOUBTFUL_SHARE * summary.framesets:
         warn(
