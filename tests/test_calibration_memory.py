@@ -78,6 +78,17 @@ def test_live_begins_with_what_the_last_run_of_the_device_learnt(vga_walk: Path,
     assert LEARNT not in live(f"{simulator}&duration_s=1", "--rig", other_rig, "--forget-calibration")
 
 
+def test_live_of_one_camera_keeps_what_it_learnt_apart_from_that_of_the_pairs(
+    vga_walk: Path, tmp_path: Path, folder: Path
+) -> None:
+    simulator = f"simulator:room?recording={vga_walk}&legs=1&speed=max"
+    rig = wrong(tmp_path / "rig.yaml", load_rig(vga_walk), 0)
+    assert KEPT in live(simulator, "--rig", rig, "--cameras", "0")
+    (memory,) = folder.iterdir()
+    assert [single.name for single in load_rig(memory).singles] == ["cam0"]
+    assert live(f"{simulator}&duration_s=1", "--rig", rig, "--cameras", "0").count(LEARNT) == 1
+
+
 def test_live_keeps_nothing_of_recordings_and_where_the_calibration_is_not_estimated(
     room_walk: Path, tmp_path: Path, folder: Path
 ) -> None:

@@ -150,7 +150,7 @@ def _memory(source: str, name: str, rig: Rig, settings: Config, forget_calibrati
     from graphvio.live.calibration_memory import CalibrationMemory, devices_of
 
     devices = devices_of(source, name)
-    if devices is None or not rig.pairs or not settings.estimates_calibration:
+    if devices is None or not settings.estimates_calibration:
         return None
     memory = CalibrationMemory(devices, rig)
     if forget_calibration:
