@@ -27,7 +27,7 @@ class Case:
         components: of the calibration error, or ``all``.
         seed: by which it was sampled.
         config: profile, and the values that were set.
-        pairs: which took part.
+        pairs: which took part; ``none`` where each camera is single, ``one-camera`` of one alone.
         imu: ``yes`` or ``no``.
     """
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -15,12 +16,14 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
+from graphvio.rig import Rig
 from graphvio.simulation import RIG_CHANGES, SCENE_NAMES
 from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationError
 
 _SCENES = ("room", "corridor", "stairs", "calibration")
 _BOTH = "both"
 _PAIRS = {_BOTH: (0, 1), "front": (0,), "back": (1,)}
+_SINGLES = {"none": "each by itself", "one-camera": "the first one alone"}
 _ROUNDING = 1e-6
 _OUT = Path("results") / "benchmarks" / "calibration-error.csv"
 
@@ -48,7 +51,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--rig-change", choices=list(RIG_CHANGES), help="the true cameras change on the way (default: they do not)"
     )
     parser.add_argument("--duration", type=float, metavar="S", help="only so much of each walk")
-    parser.add_argument("--pairs", nargs="+", choices=list(_PAIRS), default=list(_PAIRS), help="default: all three")
+    parser.add_argument(
+        "--pairs",
+        nargs="+",
+        choices=[*_PAIRS, *_SINGLES],
+        default=list(_PAIRS),
+        help="none: with the IMU, each camera by itself; one-camera: the first one alone (default: both front back)",
+    )
     imu = parser.add_mutually_exclusive_group()
     imu.add_argument("--no-imu", action="store_true", help="only runs without the IMU")
     imu.add_argument("--imu", action="store_true", help="only runs with the IMU")
@@ -77,6 +86,8 @@ def run_all(args: argparse.Namespace) -> None:
             raise GraphvioError(f"there is no scene {scene!r}; choose from {', '.join(SCENE_NAMES)}")
     if args.seeds < 1 or args.first_seed < 0:
         raise GraphvioError("--seeds must be at least 1, and --first-seed not negative")
+    if args.no_imu and not set(args.pairs) & set(_PAIRS):
+        raise GraphvioError("--no-imu leaves nothing to run: without a pair, only the IMU shows the scale")
     levels = [*([] if args.no_exact else [EXACT]), *args.levels]
     errors = {level: _error(level, args.components) for level in levels}
     config = _config(args.config, args.set)
@@ -95,7 +106,7 @@ def run_all(args: argparse.Namespace) -> None:
                     continue
                 walk = WronglyCalibrated(folder, scene, args.duration, args.rig_change, errors[level], seed)
                 for case in missing:
-                    results[case] = walk.run(config, _PAIRS[case.pairs], case.imu == "yes")
+                    results[case] = walk.run(config, partial(_selected, case=case))
                     append_outcome(args.out, case, results[case])
                     print(_line(case, results[case]), flush=True)
     except KeyboardInterrupt:
@@ -103,7 +114,8 @@ def run_all(args: argparse.Namespace) -> None:
         args.docs = False
     _tables(report, results)
     if args.docs:
-        report.save_to_docs("calibration-error")
+        has_pairs = bool(set(args.pairs) & set(_PAIRS))
+        report.save_to_docs("calibration-error" if has_pairs else "calibration-error-singles")
 
 
 def _rendered(args: argparse.Namespace, scene: str) -> Path:
@@ -148,7 +160,17 @@ def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Itera
         if (imu == "yes" and args.no_imu) or (imu == "no" and args.imu):
             continue
         for pairs in args.pairs:
+            if imu == "no" and pairs in _SINGLES:
+                continue
             yield Case(scene, duration, args.rig_change or "none", level, components, seed, config, pairs, imu)
+
+
+def _selected(rig: Rig, case: Case) -> Rig:
+    """Return the part of a rig that a case runs."""
+    if case.pairs == "one-camera":
+        return rig.with_only([rig.cameras[0].name])
+    chosen = rig.without_pairs() if case.pairs == "none" else rig.with_pairs(_PAIRS[case.pairs])
+    return chosen if case.imu == "yes" else chosen.without_imu()
 
 
 def _line(case: Case, outcome: CalibrationOutcome) -> str:
@@ -165,20 +187,27 @@ def _line(case: Case, outcome: CalibrationOutcome) -> str:
 
 def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
     """Print the accuracy of each scene and level, and the errors of the parameters before and after."""
+    of_pairs = {case: outcome for case, outcome in results.items() if case.pairs in _PAIRS}
+    of_singles = {case: outcome for case, outcome in results.items() if case.pairs in _SINGLES}
+    if of_pairs:
+        _tables_of_pairs(report, of_pairs)
+    if of_singles:
+        _tables_of_singles(report, of_singles)
+
+
+def _tables_of_pairs(report: Report, results: Mapping[Case, CalibrationOutcome]) -> None:
     by_group: dict[tuple[str, int, str], dict[str, dict[int, CalibrationOutcome]]] = {}
     for case, outcome in results.items():
         of_pairs = by_group.setdefault((case.scene, case.level, case.imu), {pairs: {} for pairs in _PAIRS})
         of_pairs[case.pairs][case.seed] = outcome
     rows, parameter_rows = [], []
     for (scene, level, imu), runs in by_group.items():
-        here = [scene, "exact" if level == EXACT else f"{level}", imu]
+        here = [scene, _level_text(level), imu]
         exact = by_group.get((scene, EXACT, imu))
         rows.append([*here, *_accuracy_cells(runs, exact[_BOTH].get(0) if exact is not None else None)])
         both = list(runs[_BOTH].values())
-        if any(error > _ROUNDING for outcome in both for error in outcome.before.values()):
+        if _are_wrong(both):
             parameter_rows.append([*here, *(_before_after(both, name) for name in _PARAMETERS)])
-    if not rows:
-        return
     report.add(
         "### Accuracy",
         "ATE in cm and ratio to the better single pair: median / worst of the draws. Ratio to the exact files: of the "
@@ -203,6 +232,51 @@ def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
             "Rms errors of the files -> of the rig that the odometry estimated with both pairs; medians of the draws.",
         )
         report.table(["scene", "level", "IMU", *_PARAMETERS.values()], parameter_rows)
+
+
+def _tables_of_singles(report: Report, results: Mapping[Case, CalibrationOutcome]) -> None:
+    by_group: dict[tuple[str, str, int], list[CalibrationOutcome]] = {}
+    for case, outcome in results.items():
+        by_group.setdefault((case.scene, case.pairs, case.level), []).append(outcome)
+    rows, parameter_rows = [], []
+    for (scene, cameras, level), runs in by_group.items():
+        here = [scene, _SINGLES[cameras], _level_text(level)]
+        exact = by_group.get((scene, cameras, EXACT))
+        rows.append(
+            [
+                *here,
+                f"{len(runs)}",
+                _median_and_worst([100 * run.ate_m for run in runs]),
+                f"{median(run.ate_m for run in runs) / exact[0].ate_m:.2f}" if exact is not None else "-",
+                _median_and_worst([run.pose_nees for run in runs]),
+                f"{min(run.posed_percent for run in runs):.0f}",
+                f"{max(run.epochs for run in runs)}",
+            ]
+        )
+        if _are_wrong(runs):
+            parameter_rows.append([*here, *(_before_after(runs, name) for name in _PARAMETERS_OF_SINGLES)])
+    report.add(
+        "### Accuracy of single cameras",
+        "With the IMU. ATE in cm: median / worst of the draws. Ratio to the exact files: of the medians. Pose NEES: of "
+        "poses since the first one, 1 where covariances are right. With pose: framesets of the worst draw, and "
+        "none before the scale is known. Epochs: most of a draw.",
+    )
+    head = ["scene", "cameras", "level", "draws", "ATE, cm", "/ exact files", "pose NEES / 6", "with pose, %", "epochs"]
+    report.table(head, rows)
+    if parameter_rows:
+        report.add(
+            "### Calibration parameters of single cameras",
+            "Rms errors of the files -> of the rig that the odometry estimated; medians of the draws.",
+        )
+        report.table(["scene", "cameras", "level", *_PARAMETERS_OF_SINGLES.values()], parameter_rows)
+
+
+def _level_text(level: int) -> str:
+    return "exact" if level == EXACT else f"{level}"
+
+
+def _are_wrong(outcomes: Sequence[CalibrationOutcome]) -> bool:
+    return any(error > _ROUNDING for outcome in outcomes for error in outcome.before.values())
 
 
 def _accuracy_cells(runs: dict[str, dict[int, CalibrationOutcome]], exact: CalibrationOutcome | None) -> list[str]:
@@ -237,6 +311,12 @@ _PARAMETERS = {
     "cameras_in_body_deg": "in body, deg",
     "cameras_in_body_mm": "in body, mm",
     "time_offset_ms": "offset, ms",
+}
+
+_PARAMETERS_OF_SINGLES = {
+    name: text.replace("P_12", "between cameras")
+    for name, text in _PARAMETERS.items()
+    if name not in ("left_right_deg", "baseline_percent")
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -94,9 +94,9 @@ class WronglyCalibrated:
             )
         ]
 
-    def run(self, config: Config, pairs: tuple[int, ...], imu: bool) -> CalibrationOutcome:
-        """Run the odometry with some of the pairs, with or without the IMU."""
-        written, true = (_selected(rig, pairs, imu) for rig in (self._written_rig, self._true_rig))
+    def run(self, config: Config, select: Callable[[Rig], Rig]) -> CalibrationOutcome:
+        """Run the odometry with what is selected of the rig."""
+        written, true = (select(rig) for rig in (self._written_rig, self._true_rig))
         warm_up(written, config)
         odometry = Odometry(written, config)
         begin = perf_counter()
@@ -128,7 +128,7 @@ class WronglyCalibrated:
 
     def _measurements(self, rig: Rig) -> Iterator[Measurement]:
         """Merge the images on disk with the samples in memory."""
-        source = open_source(self._folder, rig.without_imu(), to_s=self._duration_s)
+        source = open_source(self._folder, rig, to_s=self._duration_s)
         framesets = (measurement for measurement in source if isinstance(measurement, FrameSet))
         if rig.imu is None:
             return framesets
@@ -149,11 +149,6 @@ def _pose_nees(estimates: Sequence[Estimate], truth: Trajectory) -> float:
         error = se3_log(se3_inverse(nav_T_world @ true[estimate.stamp_ns]) @ estimate.nav_T_body)
         nees.append(float(error @ np.linalg.solve(estimate.covariance, error)) / len(error))
     return float(np.mean(nees))
-
-
-def _selected(rig: Rig, pairs: tuple[int, ...], imu: bool) -> Rig:
-    chosen = rig.with_pairs(pairs)
-    return chosen if imu else chosen.without_imu()
 
 
 def _rms(rig: Rig, true_rig: Rig) -> dict[str, float]:
