@@ -13,7 +13,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.curves import curves_of, values_of, with_sigma
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import Gaussian
-from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, parameter_names
+from graphvio.self_calibration.parameters import BODY, PAIR, PLACE, SINGLE, STEREO, parameter_names
 from graphvio.self_calibration.prior import file_prior
 from graphvio.simulation.default_rig import default_rig
 
@@ -62,6 +62,21 @@ def test_curves_have_their_units_and_the_file_s_standard_deviations() -> None:
     for name, value in expected.items():
         assert found.pop(name) == pytest.approx(value), name
     assert [value for value, _ in found.values()] == pytest.approx(np.zeros(len(found)))
+
+
+def test_curves_of_single_cameras_are_of_lenses_and_of_places_against_the_first() -> None:
+    rig = default_rig().without_pairs()
+    index = {name: i for i, name in enumerate(parameter_names(rig))}
+    difference = np.zeros(len(index))
+    difference[index["cam3.cy_px"]] = 0.7
+    difference[SINGLE + PLACE + 1] = np.deg2rad(0.2)
+    difference[index["imu.time_offset_s"]] = -0.0015
+    found = values_by_name(rig, difference)
+    assert found[("principal points", "cam3 cy")] == pytest.approx((0.7, 0.5))
+    assert found[("cameras against cam0, rotation", "cam1 y")] == pytest.approx((0.2, 0.3))
+    assert found[("IMU, time offset", "")] == pytest.approx((-1.5, 2.0))
+    assert not any(group.startswith(("left to right", "baselines", "pairs")) for group, _ in found)
+    assert sum(group == "cameras against cam0, translation" for group, _ in found) == 9
 
 
 def test_curves_without_imu_have_no_imu() -> None:
