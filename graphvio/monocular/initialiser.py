@@ -40,7 +40,7 @@ _STEPS = 40
 ACCEL_BIAS_SIGMA = 0.15
 _MAX_SIGMAS = 5.0
 _ROUGH, _ROUGH_STEPS = 10.0, 15  # sigmas of the first adjustment by a rig file that is wrong
-_DOUBTS_EVERY = 3  # windows that fit no motion with an exact file
+_FIRST_DOUBT = 3  # windows that fit no motion with an exact file, until that is doubted
 _OTHER_SCALES = (0.6, 1.7)
 _MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
 POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
@@ -94,7 +94,7 @@ class Initialiser:
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
         self._fits_no_motion = False  # the window that was tested last
-        self._contradicted = 0  # windows
+        self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows
         self.reason = "no image has come"
         self.scale_sigma = np.inf  # of the window that was tested last, as a share
 
@@ -138,8 +138,10 @@ class Initialiser:
             return [_NO_FACTORS]
         candidates = self._calibration.candidates
         self._contradicted += self._fits_no_motion
-        is_tried = self._fits_no_motion and self._contradicted % _DOUBTS_EVERY == 0
-        return candidates if is_tried else candidates[:1]
+        if not self._fits_no_motion or self._contradicted < self._doubted_at:
+            return candidates[:1]
+        self._doubted_at *= 2  # each attempt takes as long as many framesets
+        return candidates
 
     def _solved(self, factors: Float) -> Window | None:
         """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
