@@ -12,16 +12,19 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.cameras import distort, distortion_basis
 from graphvio.geometry import so3_exp
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, vector_kernel
 from graphvio.rig import Rig
 from graphvio.self_calibration.bundle import rows_of
 from graphvio.self_calibration.parameters import CAMERA, INTRINSICS, PLACE, SINGLE
 
 POSE = 6
-_PLACE_AT = POSE + PLACE  # columns of a view's rows
-_POINT_AT = POSE + SINGLE
-_ERROR_AT = _POINT_AT + 3
-_COLUMNS = _ERROR_AT + 1
+# Columns of a view's rows: [camera 15, error, pose 6, none 2, landmark 3], so that loops over them have lengths of 16
+# and 24, which fill vector registers.
+_ERROR_AT = SINGLE
+_POSE_AT = _ERROR_AT + 1
+_OF_STATE = 24
+_POINT_AT = _OF_STATE
+_COLUMNS = _POINT_AT + 3
 
 PRIOR_INVERSE_DEPTH = 0.2
 _PRIOR_INFORMATION = 1e-2  # of an inverse depth, known to 10 / m: more would pull the scale of all landmarks
@@ -150,9 +153,11 @@ def _by_lens(cameras: Cameras, j: int, x: float, y: float, out: Float) -> None:
 @kernel
 def _view(
     pose: Float, cameras: Cameras, j: int, frame: Float, landmark: Float, ray: Float, sigma_px: float,
-    by_lens: Float, rows: Float,
+    of_state: bool, by_lens: Float, rows: Float,
 ) -> bool:  # fmt: skip
     """Fill the rows (2, _COLUMNS) of one view: derivatives by pose, camera and landmark, and the error, whitened.
+
+    Coordinates are variables throughout: arrays would be allocated for each view.
 
     Args:
         pose: (4, 4) ``odom_T_body``.
@@ -162,6 +167,7 @@ def _view(
         landmark: (3,).
         ray: (2,) that was seen, by the lens of the rig file.
         sigma_px: noise of a corner's position.
+        of_state: whether derivatives by pose and camera are wanted, too.
         by_lens: (2, 9) for intermediate results; (0, 9) where the lens is that of the rig file, and no derivatives by
             the camera are wanted.
         rows: output.
@@ -171,54 +177,52 @@ def _view(
     """
     a, b, w, body_T_cam = landmark[0], landmark[1], landmark[2], cameras.body_T_cam[j]
     scale = cameras.focal_px[j] / sigma_px
-    odom, body, left, cam = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for r in range(3):
-        odom[r] = frame[r, 0] * a + frame[r, 1] * b + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
-    for r in range(3):
-        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2]
-        left[r] = body[r] - w * body_T_cam[r, 3]
-    for r in range(3):
-        cam[r] = 0.0
-        for k in range(3):
-            cam[r] += body_T_cam[k, r] * left[k]
-    if not cam[2] > _MIN_DEPTH_RATIO:
+    from_x, from_y, from_z = frame[0, 3] - pose[0, 3], frame[1, 3] - pose[1, 3], frame[2, 3] - pose[2, 3]
+    odom_x = frame[0, 0] * a + frame[0, 1] * b + frame[0, 2] + w * from_x
+    odom_y = frame[1, 0] * a + frame[1, 1] * b + frame[1, 2] + w * from_y
+    odom_z = frame[2, 0] * a + frame[2, 1] * b + frame[2, 2] + w * from_z
+    body_x = pose[0, 0] * odom_x + pose[1, 0] * odom_y + pose[2, 0] * odom_z
+    body_y = pose[0, 1] * odom_x + pose[1, 1] * odom_y + pose[2, 1] * odom_z
+    body_z = pose[0, 2] * odom_x + pose[1, 2] * odom_y + pose[2, 2] * odom_z
+    left_x, left_y, left_z = body_x - w * body_T_cam[0, 3], body_y - w * body_T_cam[1, 3], body_z - w * body_T_cam[2, 3]
+    cam_x = body_T_cam[0, 0] * left_x + body_T_cam[1, 0] * left_y + body_T_cam[2, 0] * left_z
+    cam_y = body_T_cam[0, 1] * left_x + body_T_cam[1, 1] * left_y + body_T_cam[2, 1] * left_z
+    cam_z = body_T_cam[0, 2] * left_x + body_T_cam[1, 2] * left_y + body_T_cam[2, 2] * left_z
+    if not cam_z > _MIN_DEPTH_RATIO:
         return False
-    u, v = cam[0] / cam[2], cam[1] / cam[2]
+    u, v, by_depth = cam_x / cam_z, cam_y / cam_z, scale / cam_z
     if len(by_lens):
         _by_lens(cameras, j, u, v, by_lens)
     for r in range(2):
         at = u if r == 0 else v
-        m0 = scale * (body_T_cam[0, r] - at * body_T_cam[0, 2]) / cam[2]
-        m1 = scale * (body_T_cam[1, r] - at * body_T_cam[1, 2]) / cam[2]
-        m2 = scale * (body_T_cam[2, r] - at * body_T_cam[2, 2]) / cam[2]
-        rows[r, 0] = m1 * body[2] - m2 * body[1]
-        rows[r, 1] = m2 * body[0] - m0 * body[2]
-        rows[r, 2] = m0 * body[1] - m1 * body[0]
-        rows[r, 3], rows[r, 4], rows[r, 5] = -w * m0, -w * m1, -w * m2
+        m0 = by_depth * (body_T_cam[0, r] - at * body_T_cam[0, 2])
+        m1 = by_depth * (body_T_cam[1, r] - at * body_T_cam[1, 2])
+        m2 = by_depth * (body_T_cam[2, r] - at * body_T_cam[2, 2])
         # From body to odom, and there by the columns of the landmark's frame.
         o0 = m0 * pose[0, 0] + m1 * pose[0, 1] + m2 * pose[0, 2]
         o1 = m0 * pose[1, 0] + m1 * pose[1, 1] + m2 * pose[1, 2]
         o2 = m0 * pose[2, 0] + m1 * pose[2, 1] + m2 * pose[2, 2]
         rows[r, _POINT_AT] = o0 * frame[0, 0] + o1 * frame[1, 0] + o2 * frame[2, 0]
         rows[r, _POINT_AT + 1] = o0 * frame[0, 1] + o1 * frame[1, 1] + o2 * frame[2, 1]
-        rows[r, _POINT_AT + 2] = (
-            o0 * (frame[0, 3] - pose[0, 3])
-            + o1 * (frame[1, 3] - pose[1, 3])
-            + o2 * (frame[2, 3] - pose[2, 3])
-            - m0 * body_T_cam[0, 3]
-            - m1 * body_T_cam[1, 3]
-            - m2 * body_T_cam[2, 3]
-        )
-        rows[r, _ERROR_AT] = scale * (at - ray[r])
+        of_cam = m0 * body_T_cam[0, 3] + m1 * body_T_cam[1, 3] + m2 * body_T_cam[2, 3]
+        rows[r, _POINT_AT + 2] = o0 * from_x + o1 * from_y + o2 * from_z - of_cam
+        error = at - ray[r]
+        for c in range(CAMERA if len(by_lens) else 0):
+            error -= by_lens[r, c] * cameras.lenses[j, c]
+        rows[r, _ERROR_AT] = scale * error
+        if not of_state:
+            continue
+        rows[r, _POSE_AT] = m1 * body_z - m2 * body_y
+        rows[r, _POSE_AT + 1] = m2 * body_x - m0 * body_z
+        rows[r, _POSE_AT + 2] = m0 * body_y - m1 * body_x
+        rows[r, _POSE_AT + 3], rows[r, _POSE_AT + 4], rows[r, _POSE_AT + 5] = -w * m0, -w * m1, -w * m2
         if len(by_lens):
             for c in range(CAMERA):
-                rows[r, POSE + c] = -scale * by_lens[r, c]
-                rows[r, _ERROR_AT] -= scale * by_lens[r, c] * cameras.lenses[j, c]
-            rows[r, _PLACE_AT] = m1 * left[2] - m2 * left[1]
-            rows[r, _PLACE_AT + 1] = m2 * left[0] - m0 * left[2]
-            rows[r, _PLACE_AT + 2] = m0 * left[1] - m1 * left[0]
-            for c in range(3):
-                rows[r, _PLACE_AT + 3 + c] = rows[r, 3 + c]
+                rows[r, c] = -scale * by_lens[r, c]
+            rows[r, PLACE] = m1 * left_z - m2 * left_y
+            rows[r, PLACE + 1] = m2 * left_x - m0 * left_z
+            rows[r, PLACE + 2] = m0 * left_y - m1 * left_x
+            rows[r, PLACE + 3], rows[r, PLACE + 4], rows[r, PLACE + 5] = -w * m0, -w * m1, -w * m2
     return True
 
 
@@ -234,7 +238,7 @@ def _inverse3(m: Float, out: Float) -> None:
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
 
 
-@kernel
+@vector_kernel
 def visual_equations(
     poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, scale: float,
     eliminated: Eliminated,
@@ -257,132 +261,161 @@ def visual_equations(
     n_poses, n_calibration, n_cameras = POSE * len(poses), eliminated.by_cameras.shape[2], len(cameras.focal_px)
     size, calibrates = n_poses + n_calibration, n_calibration > 0
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    errors2, cost, rows, v, bl = (
-        np.zeros(len(structure.state)),
-        0.0,
-        np.zeros((2, _COLUMNS)),
-        np.zeros((3, 3)),
-        np.zeros(3),
-    )
+    errors2, cost, rows = np.zeros(len(structure.state)), 0.0, np.zeros((2, _COLUMNS))
+    u, v = rows[0], rows[1]
+    inverse, b, per_scale2 = np.zeros((3, 3)), np.zeros(3), 1.0 / (scale * scale)
+    normal = np.zeros((3, 3))
     by_lens = np.zeros((2 if calibrates or _have_moved(cameras) else 0, CAMERA))
-    of_camera_end = _POINT_AT if calibrates else POSE
-    seen, weighed = np.zeros(n_cameras, dtype=np.bool_), np.zeros((3, n_calibration))
+    # Sums over all views of a camera from a state, by their columns, and over all views of a camera.
+    of_states = np.zeros((len(poses) * n_cameras, POSE, _OF_STATE))
+    of_cameras = np.zeros((n_cameras, SINGLE, _POSE_AT))
+    # A landmark's couplings, and these times its inverse normal matrix, for all poses and cameras.
+    coupled, weighed = np.zeros((3, size)), np.zeros((3, size))
+    seen = np.zeros(n_cameras, dtype=np.bool_)
     for point in range(len(landmarks)):
         first, last = structure.rows[point], structure.rows[point + 1]
+        if last <= first:
+            continue
+        begin, end = POSE * structure.state[first], POSE * (structure.state[last - 1] + 1)
         away = landmarks[point, 2] - PRIOR_INVERSE_DEPTH
         cost += 0.5 * _PRIOR_INFORMATION * away * away
-        by_cameras = eliminated.by_cameras[point]
-        for c in range(3):
-            bl[c] = _PRIOR_INFORMATION * away if c == 2 else 0.0
-            for d in range(3):
-                v[c, d] = _PRIOR_INFORMATION if c == 2 and d == 2 else 0.0
+        of_calibration = eliminated.by_cameras[point]
+        b0, b1, b2 = 0.0, 0.0, _PRIOR_INFORMATION * away
+        v00, v01, v02, v11, v12, v22 = 1e-9, 0.0, 0.0, 1e-9, 0.0, _PRIOR_INFORMATION
+        for r in range(3):
+            for c in range(begin, end):
+                coupled[r, c] = 0.0
         for j in range(n_cameras):
             seen[j] = False
         for n in range(first, last):
-            k, j, couplings = POSE * structure.state[n], structure.camera[n], eliminated.by_pose[n]
+            k, j, by_pose = structure.state[n], structure.camera[n], eliminated.by_pose[n]
             in_front = _view(
-                poses[structure.state[n]], cameras, j, structure.odom_T_landmark[point], landmarks[point],
-                structure.rays[n], sigma_px, by_lens, rows,
+                poses[k], cameras, j, structure.odom_T_landmark[point], landmarks[point], structure.rays[n], sigma_px,
+                True, by_lens, rows,
             )  # fmt: skip
-            e2 = rows[0, _ERROR_AT] ** 2 + rows[1, _ERROR_AT] ** 2 if in_front else _ERROR2_BEHIND
+            e2 = u[_ERROR_AT] * u[_ERROR_AT] + v[_ERROR_AT] * v[_ERROR_AT] if in_front else _ERROR2_BEHIND
             errors2[n] = e2
-            cost += 0.5 * scale * scale * np.log(1.0 + e2 / (scale * scale))
-            weight = 1.0 / (1.0 + e2 / (scale * scale)) if in_front else 0.0
-            at = n_poses + SINGLE * j - POSE  # where column POSE of the rows is
+            cost += 0.5 * scale * scale * np.log(1.0 + e2 * per_scale2)
+            if not in_front:
+                for r in range(3):
+                    for c in range(POSE):
+                        by_pose[r, c] = 0.0
+                continue
+            root_weight = np.sqrt(1.0 / (1.0 + e2 * per_scale2))
+            for c in range(_COLUMNS):
+                u[c] *= root_weight
+                v[c] *= root_weight
+            for r in range(3):
+                pu, pv = u[_POINT_AT + r], v[_POINT_AT + r]
+                for c in range(POSE):
+                    by_pose[r, c] = pu * u[_POSE_AT + c] + pv * v[_POSE_AT + c]
+                    coupled[r, POSE * k + c] += by_pose[r, c]
+            sums = of_states[k * n_cameras + j]
             for c in range(POSE):
-                for d in range(3):
-                    couplings[d, c] = weight * (
-                        rows[0, c] * rows[0, _POINT_AT + d] + rows[1, c] * rows[1, _POINT_AT + d]
-                    )
-                gradient[k + c] += weight * (rows[0, c] * rows[0, _ERROR_AT] + rows[1, c] * rows[1, _ERROR_AT])
-                for d in range(c, POSE):
-                    hessian[k + c, k + d] += weight * (rows[0, c] * rows[0, d] + rows[1, c] * rows[1, d])
-                for d in range(POSE, of_camera_end):
-                    hessian[k + c, at + d] += weight * (rows[0, c] * rows[0, d] + rows[1, c] * rows[1, d])
-            if calibrates and in_front:
+                cu, cv = u[_POSE_AT + c], v[_POSE_AT + c]
+                if calibrates:
+                    for d in range(_OF_STATE):
+                        sums[c, d] += cu * u[d] + cv * v[d]
+                else:
+                    for d in range(_ERROR_AT, _OF_STATE):
+                        sums[c, d] += cu * u[d] + cv * v[d]
+            if calibrates:
                 seen[j] = True
-                for c in range(POSE, _POINT_AT):
-                    of_u, of_v = weight * rows[0, c], weight * rows[1, c]
-                    for d in range(3):
-                        by_cameras[d, SINGLE * j + c - POSE] += (
-                            of_u * rows[0, _POINT_AT + d] + of_v * rows[1, _POINT_AT + d]
-                        )
-                    gradient[at + c] += of_u * rows[0, _ERROR_AT] + of_v * rows[1, _ERROR_AT]
-                    for d in range(c, _POINT_AT):
-                        hessian[at + c, at + d] += of_u * rows[0, d] + of_v * rows[1, d]
+                sums = of_cameras[j]
+                for c in range(SINGLE):
+                    cu, cv = u[c], v[c]
+                    for d in range(_POSE_AT):
+                        sums[c, d] += cu * u[d] + cv * v[d]
+                for r in range(3):
+                    pu, pv = u[_POINT_AT + r], v[_POINT_AT + r]
+                    for c in range(SINGLE):
+                        of_calibration[r, SINGLE * j + c] += pu * u[c] + pv * v[c]
+            x0, y0, z0, e0 = u[_POINT_AT], u[_POINT_AT + 1], u[_POINT_AT + 2], u[_ERROR_AT]
+            x1, y1, z1, e1 = v[_POINT_AT], v[_POINT_AT + 1], v[_POINT_AT + 2], v[_ERROR_AT]
+            b0, b1, b2 = b0 + x0 * e0 + x1 * e1, b1 + y0 * e0 + y1 * e1, b2 + z0 * e0 + z1 * e1
+            v00, v01, v02 = v00 + x0 * x0 + x1 * x1, v01 + x0 * y0 + x1 * y1, v02 + x0 * z0 + x1 * z1
+            v11, v12, v22 = v11 + y0 * y0 + y1 * y1, v12 + y0 * z0 + y1 * z1, v22 + z0 * z0 + z1 * z1
+        normal[0, 0], normal[0, 1], normal[0, 2] = v00, v01, v02
+        normal[1, 1], normal[1, 2], normal[2, 2] = v11, v12, v22
+        b[0], b[1], b[2] = b0, b1, b2
+        _inverse3(normal, inverse)
+        for r in range(3):
+            eliminated.gradient[point, r] = b[r]
             for c in range(3):
-                bl[c] += weight * (
-                    rows[0, _POINT_AT + c] * rows[0, _ERROR_AT] + rows[1, _POINT_AT + c] * rows[1, _ERROR_AT]
-                )
-                for d in range(c, 3):
-                    v[c, d] += weight * (
-                        rows[0, _POINT_AT + c] * rows[0, _POINT_AT + d]
-                        + rows[1, _POINT_AT + c] * rows[1, _POINT_AT + d]
-                    )
-        v[0, 0] += 1e-9
-        v[1, 1] += 1e-9
-        inverse = eliminated.inverse[point]
-        _inverse3(v, inverse)
-        for c in range(3):
-            eliminated.gradient[point, c] = bl[c]
-        for n in range(first, last):
-            k, one = POSE * structure.state[n], eliminated.by_pose[n]
+                eliminated.inverse[point, r, c] = inverse[r, c]
+        _weigh(inverse, coupled, begin, end, weighed, b, gradient)
+        for c in range(begin, end):
+            _subtract(coupled, weighed, c, c, end, hessian)
+        for j in range(n_cameras):
+            if not seen[j]:
+                continue
+            at = n_poses + SINGLE * j
+            for r in range(3):
+                for c in range(SINGLE):
+                    coupled[r, at + c] = of_calibration[r, SINGLE * j + c]
+            _weigh(inverse, coupled, at, at + SINGLE, weighed, b, gradient)
+            for c in range(begin, end):
+                _subtract(coupled, weighed, c, at, at + SINGLE, hessian)
+            for i in range(j + 1):
+                for c in range(n_poses + SINGLE * i, n_poses + SINGLE * (i + 1) if seen[i] else 0):
+                    _subtract(coupled, weighed, c, at, at + SINGLE, hessian)
+    for k in range(len(poses)):
+        for j in range(n_cameras):
+            sums, at, of_camera = of_states[k * n_cameras + j], POSE * k, n_poses + SINGLE * j
             for c in range(POSE):
-                x = inverse[0, 0] * one[0, c] + inverse[0, 1] * one[1, c] + inverse[0, 2] * one[2, c]
-                y = inverse[1, 0] * one[0, c] + inverse[1, 1] * one[1, c] + inverse[1, 2] * one[2, c]
-                z = inverse[2, 0] * one[0, c] + inverse[2, 1] * one[1, c] + inverse[2, 2] * one[2, c]
-                gradient[k + c] -= x * bl[0] + y * bl[1] + z * bl[2]
-                for m in range(n, last):
-                    other, k2 = eliminated.by_pose[m], POSE * structure.state[m]
-                    for d in range(c if m == n else 0, POSE):
-                        product = x * other[0, d] + y * other[1, d] + z * other[2, d]
-                        if k == k2 and m > n:  # of one state: the block's other half is this one's transpose
-                            hessian[k + min(c, d), k + max(c, d)] -= 2.0 * product if c == d else product
-                        else:
-                            hessian[k + c, k2 + d] -= product
-                for j in range(n_cameras if calibrates else 0):
-                    if seen[j]:
-                        for d in range(SINGLE * j, SINGLE * (j + 1)):
-                            hessian[k + c, n_poses + d] -= (
-                                x * by_cameras[0, d] + y * by_cameras[1, d] + z * by_cameras[2, d]
-                            )
-        if calibrates:
-            _eliminate_from_cameras(inverse, bl, by_cameras, seen, weighed, hessian, gradient)
+                gradient[at + c] += sums[c, _ERROR_AT]
+                for d in range(POSE):
+                    hessian[at + c, at + d] += sums[c, _POSE_AT + d]
+                for d in range(SINGLE if calibrates else 0):
+                    hessian[at + c, of_camera + d] += sums[c, d]
+    for j in range(n_cameras if calibrates else 0):
+        sums, at = of_cameras[j], n_poses + SINGLE * j
+        for c in range(SINGLE):
+            gradient[at + c] += sums[c, _ERROR_AT]
+            for d in range(SINGLE):
+                hessian[at + c, at + d] += sums[c, d]
     for c in range(size):
         for d in range(c):
             hessian[c, d] = hessian[d, c]
     return hessian, gradient, cost, errors2
 
 
-@kernel
-def _eliminate_from_cameras(
-    inverse: Float, bl: Float, by_cameras: Float, seen: Bool, weighed: Float, hessian: Float, gradient: Float
+@vector_kernel
+def _weigh(
+    inverse: Float, coupled: Float, begin: int, end: int, weighed: Float, of_landmark: Float, gradient: Float
 ) -> None:
-    """Subtract what a landmark takes from the information on the parameters (n,) of the cameras that see it.
+    """Multiply a landmark's couplings with some unknowns by its inverse normal matrix, and eliminate its gradient.
 
     Args:
-        inverse: (3, 3) of the landmark's normal matrix.
-        bl: (3,) gradient by the landmark.
-        by_cameras: (3, n) coupling.
-        seen: (C,) which cameras see it.
-        weighed: (3, n) for intermediate results.
-        hessian: whose last n columns are changed, in the upper triangle.
-        gradient: whose last n elements are changed.
+        inverse: (3, 3) of its normal matrix.
+        coupled: (3, n) couplings.
+        begin: first of the unknowns.
+        end: of these.
+        weighed: (3, n), output in their columns.
+        of_landmark: (3,) its gradient.
+        gradient: (n,) is changed.
     """
-    at = len(gradient) - by_cameras.shape[1]
-    for i in range(len(seen)):
-        for c in range(SINGLE * i, SINGLE * (i + 1) if seen[i] else 0):
-            for r in range(3):
-                weighed[r, c] = (
-                    inverse[r, 0] * by_cameras[0, c]
-                    + inverse[r, 1] * by_cameras[1, c]
-                    + inverse[r, 2] * by_cameras[2, c]
-                )
-            x, y, z = weighed[0, c], weighed[1, c], weighed[2, c]
-            gradient[at + c] -= x * bl[0] + y * bl[1] + z * bl[2]
-            for j in range(i, len(seen)):
-                for d in range(max(c, SINGLE * j), SINGLE * (j + 1) if seen[j] else 0):
-                    hessian[at + c, at + d] -= x * by_cameras[0, d] + y * by_cameras[1, d] + z * by_cameras[2, d]
+    b0, b1, b2 = of_landmark[0], of_landmark[1], of_landmark[2]
+    if begin < 0:
+        return  # never: but the compiler learns from it that no index counts from the end
+    for c in range(begin, end):
+        a0, a1, a2 = coupled[0, c], coupled[1, c], coupled[2, c]
+        t0 = inverse[0, 0] * a0 + inverse[0, 1] * a1 + inverse[0, 2] * a2
+        t1 = inverse[1, 0] * a0 + inverse[1, 1] * a1 + inverse[1, 2] * a2
+        t2 = inverse[2, 0] * a0 + inverse[2, 1] * a1 + inverse[2, 2] * a2
+        weighed[0, c], weighed[1, c], weighed[2, c] = t0, t1, t2
+        gradient[c] -= t0 * b0 + t1 * b1 + t2 * b2
+
+
+@vector_kernel
+def _subtract(coupled: Float, weighed: Float, row: int, begin: int, end: int, hessian: Float) -> None:
+    """Subtract what a landmark takes from one row of the normal equations (n, n), in some columns of it."""
+    a0, a1, a2 = coupled[0, row], coupled[1, row], coupled[2, row]
+    if begin < 0 or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0):  # the state does not see it
+        return
+    line, t0, t1, t2 = hessian[row], weighed[0], weighed[1], weighed[2]
+    for d in range(begin, end):
+        line[d] -= a0 * t0[d] + a1 * t1[d] + a2 * t2[d]
 
 
 @kernel
@@ -436,7 +469,7 @@ def located(
                 j = structure.camera[n]
                 if not _view(
                     poses[structure.state[n]], cameras, j, structure.odom_T_landmark[point], moved[point],
-                    structure.rays[n], sigma_px, by_lens, rows,
+                    structure.rays[n], sigma_px, False, by_lens, rows,
                 ):  # fmt: skip
                     continue
                 for c in range(3):
