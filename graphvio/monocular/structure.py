@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.cameras import distort, distortion_basis
+from graphvio.cameras import N_BASIS, distort, distortion_basis
 from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel, vector_kernel
 from graphvio.rig import Rig
@@ -31,6 +31,7 @@ _PRIOR_INFORMATION = 1e-2  # of an inverse depth, known to 10 / m: more would pu
 _ERROR2_BEHIND = 1e6  # of a landmark behind the camera
 _MIN_DEPTH_RATIO = 1e-3
 _STEPS = 6
+_LOCATED = 1e-9  # a smaller step ends the search of a landmark's place: it is less than a millionth of a pixel
 _FEW = 5  # views, of a landmark that is located again before the window is linearised
 
 
@@ -134,20 +135,15 @@ def _by_lens(cameras: Cameras, j: int, x: float, y: float, out: Float) -> None:
     if not determinant > 0.0:
         determinant = np.inf  # beyond the lens's domain: no derivatives
     basis = distortion_basis(cameras.models[j], distortion, x, y)
-    for c in range(CAMERA):
-        du, dv = 0.0, 0.0  # of the distorted coordinates
-        if c == 0:
-            du = u / fx
-        elif c == 1:
-            dv = v / fy
-        elif c == 2:
-            du = 1.0 / fx
-        elif c == 3:
-            dv = 1.0 / fy
-        else:
-            du, dv = basis[c - INTRINSICS, 0], basis[c - INTRINSICS, 1]
-        out[0, c] = -(vv * du - uv * dv) / determinant
-        out[1, c] = -(uu * dv - vu * du) / determinant
+    # Minus the inverse of the Jacobian, which takes the distorted coordinates' derivatives to those of the ray.
+    inverse = 1.0 / determinant
+    xu, xv, yu, yv = -vv * inverse, uv * inverse, vu * inverse, -uu * inverse
+    per_fx, per_fy = 1.0 / fx, 1.0 / fy
+    out[0, 0], out[1, 0], out[0, 1], out[1, 1] = xu * u * per_fx, yu * u * per_fx, xv * v * per_fy, yv * v * per_fy
+    out[0, 2], out[1, 2], out[0, 3], out[1, 3] = xu * per_fx, yu * per_fx, xv * per_fy, yv * per_fy
+    for c in range(N_BASIS):
+        out[0, INTRINSICS + c] = xu * basis[c, 0] + xv * basis[c, 1]
+        out[1, INTRINSICS + c] = yu * basis[c, 0] + yv * basis[c, 1]
 
 
 @kernel
@@ -263,15 +259,17 @@ def visual_equations(
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     errors2, cost, rows = np.zeros(len(structure.state)), 0.0, np.zeros((2, _COLUMNS))
     u, v = rows[0], rows[1]
+    # Lengths 16 and 24 that the compiler does not know: else it writes loops out number by number, without vectors.
+    of_one, of_both = 4 * cameras.intrinsics.shape[1], 6 * cameras.intrinsics.shape[1]
     inverse, b, per_scale2 = np.zeros((3, 3)), np.zeros(3), 1.0 / (scale * scale)
     normal = np.zeros((3, 3))
     by_lens = np.zeros((2 if calibrates or _have_moved(cameras) else 0, CAMERA))
-    # Sums over all views of a camera from a state, by their columns, and over all views of a camera.
+    # Sums over all views of a camera from a state, by their columns, and of two cameras.
     of_states = np.zeros((len(poses) * n_cameras, POSE, _OF_STATE))
-    of_cameras = np.zeros((n_cameras, SINGLE, _POSE_AT))
+    of_cameras = np.zeros((n_cameras * n_cameras, SINGLE, _POSE_AT))
     # A landmark's couplings, and these times its inverse normal matrix, for all poses and cameras.
-    coupled, weighed = np.zeros((3, size)), np.zeros((3, size))
-    seen = np.zeros(n_cameras, dtype=np.bool_)
+    coupled, weighed, of_camera = np.zeros((3, size)), np.zeros((3, size)), np.zeros((3, _POSE_AT))
+    seen, by_camera = np.zeros(n_cameras, dtype=np.bool_), np.zeros((n_cameras, 3, _POSE_AT))
     for point in range(len(landmarks)):
         first, last = structure.rows[point], structure.rows[point + 1]
         if last <= first:
@@ -287,6 +285,9 @@ def visual_equations(
                 coupled[r, c] = 0.0
         for j in range(n_cameras):
             seen[j] = False
+            for r in range(3):
+                for c in range(of_one):
+                    by_camera[j, r, c] = 0.0
         for n in range(first, last):
             k, j, by_pose = structure.state[n], structure.camera[n], eliminated.by_pose[n]
             in_front = _view(
@@ -302,7 +303,7 @@ def visual_equations(
                         by_pose[r, c] = 0.0
                 continue
             root_weight = np.sqrt(1.0 / (1.0 + e2 * per_scale2))
-            for c in range(_COLUMNS):
+            for c in range(of_both + 3):
                 u[c] *= root_weight
                 v[c] *= root_weight
             for r in range(3):
@@ -313,23 +314,24 @@ def visual_equations(
             sums = of_states[k * n_cameras + j]
             for c in range(POSE):
                 cu, cv = u[_POSE_AT + c], v[_POSE_AT + c]
+                sums[c, _ERROR_AT] += 0.0 if calibrates else cu * u[_ERROR_AT] + cv * v[_ERROR_AT]
                 if calibrates:
-                    for d in range(_OF_STATE):
+                    for d in range(of_both):
                         sums[c, d] += cu * u[d] + cv * v[d]
                 else:
-                    for d in range(_ERROR_AT, _OF_STATE):
+                    for d in range(of_one, of_both):
                         sums[c, d] += cu * u[d] + cv * v[d]
             if calibrates:
                 seen[j] = True
-                sums = of_cameras[j]
+                sums = of_cameras[j * n_cameras + j]
                 for c in range(SINGLE):
                     cu, cv = u[c], v[c]
-                    for d in range(_POSE_AT):
+                    for d in range(of_one):
                         sums[c, d] += cu * u[d] + cv * v[d]
                 for r in range(3):
                     pu, pv = u[_POINT_AT + r], v[_POINT_AT + r]
-                    for c in range(SINGLE):
-                        of_calibration[r, SINGLE * j + c] += pu * u[c] + pv * v[c]
+                    for c in range(of_one):
+                        by_camera[j, r, c] += pu * u[c] + pv * v[c]
             x0, y0, z0, e0 = u[_POINT_AT], u[_POINT_AT + 1], u[_POINT_AT + 2], u[_ERROR_AT]
             x1, y1, z1, e1 = v[_POINT_AT], v[_POINT_AT + 1], v[_POINT_AT + 2], v[_ERROR_AT]
             b0, b1, b2 = b0 + x0 * e0 + x1 * e1, b1 + y0 * e0 + y1 * e1, b2 + z0 * e0 + z1 * e1
@@ -352,28 +354,32 @@ def visual_equations(
             at = n_poses + SINGLE * j
             for r in range(3):
                 for c in range(SINGLE):
-                    coupled[r, at + c] = of_calibration[r, SINGLE * j + c]
+                    coupled[r, at + c] = of_calibration[r, SINGLE * j + c] = by_camera[j, r, c]
             _weigh(inverse, coupled, at, at + SINGLE, weighed, b, gradient)
-            for c in range(begin, end):
-                _subtract(coupled, weighed, c, at, at + SINGLE, hessian)
+            for r in range(3):
+                for c in range(SINGLE):
+                    of_camera[r, c] = weighed[r, at + c]
+            for k in range(structure.state[first], structure.state[last - 1] + 1):
+                _subtract_block(coupled, POSE * k, of_camera, of_one, of_states[k * n_cameras + j])
             for i in range(j + 1):
-                for c in range(n_poses + SINGLE * i, n_poses + SINGLE * (i + 1) if seen[i] else 0):
-                    _subtract(coupled, weighed, c, at, at + SINGLE, hessian)
+                if seen[i]:
+                    _subtract_block(coupled, n_poses + SINGLE * i, of_camera, of_one, of_cameras[i * n_cameras + j])
     for k in range(len(poses)):
         for j in range(n_cameras):
-            sums, at, of_camera = of_states[k * n_cameras + j], POSE * k, n_poses + SINGLE * j
+            sums, at, at_camera = of_states[k * n_cameras + j], POSE * k, n_poses + SINGLE * j
             for c in range(POSE):
                 gradient[at + c] += sums[c, _ERROR_AT]
                 for d in range(POSE):
                     hessian[at + c, at + d] += sums[c, _POSE_AT + d]
                 for d in range(SINGLE if calibrates else 0):
-                    hessian[at + c, of_camera + d] += sums[c, d]
-    for j in range(n_cameras if calibrates else 0):
-        sums, at = of_cameras[j], n_poses + SINGLE * j
-        for c in range(SINGLE):
-            gradient[at + c] += sums[c, _ERROR_AT]
-            for d in range(SINGLE):
-                hessian[at + c, at + d] += sums[c, d]
+                    hessian[at + c, at_camera + d] += sums[c, d]
+    for i in range(n_cameras if calibrates else 0):
+        for j in range(i, n_cameras):
+            sums, at, other = of_cameras[i * n_cameras + j], n_poses + SINGLE * i, n_poses + SINGLE * j
+            for c in range(SINGLE):
+                gradient[at + c] += sums[c, _ERROR_AT]
+                for d in range(SINGLE):
+                    hessian[at + c, other + d] += sums[c, d]
     for c in range(size):
         for d in range(c):
             hessian[c, d] = hessian[d, c]
@@ -413,9 +419,25 @@ def _subtract(coupled: Float, weighed: Float, row: int, begin: int, end: int, he
     a0, a1, a2 = coupled[0, row], coupled[1, row], coupled[2, row]
     if begin < 0 or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0):  # the state does not see it
         return
-    line, t0, t1, t2 = hessian[row], weighed[0], weighed[1], weighed[2]
     for d in range(begin, end):
-        line[d] -= a0 * t0[d] + a1 * t1[d] + a2 * t2[d]
+        hessian[row, d] -= a0 * weighed[0, d] + a1 * weighed[1, d] + a2 * weighed[2, d]
+
+
+@vector_kernel
+def _subtract_block(coupled: Float, at: int, of_camera: Float, n_columns: int, sums: Float) -> None:
+    """Subtract what a landmark takes from the normal equations of a few unknowns and a camera.
+
+    Args:
+        coupled: (3, n) couplings of all unknowns.
+        at: first of the few.
+        of_camera: (3, 16) what the camera's couplings were weighed to; the last column is zero.
+        n_columns: 16.
+        sums: (R, 16 at least) of R unknowns, is changed.
+    """
+    for c in range(len(sums)):
+        a0, a1, a2 = coupled[0, at + c], coupled[1, at + c], coupled[2, at + c]
+        for d in range(n_columns):
+            sums[c, d] -= a0 * of_camera[0, d] + a1 * of_camera[1, d] + a2 * of_camera[2, d]
 
 
 @kernel
@@ -480,7 +502,11 @@ def located(
             v[0, 0] += 1e-9
             v[1, 1] += 1e-9
             _inverse3(v, inverse)
+            largest = 0.0
             for r in range(3):
-                for c in range(3):
-                    moved[point, r] -= inverse[r, c] * bl[c]
+                step = inverse[r, 0] * bl[0] + inverse[r, 1] * bl[1] + inverse[r, 2] * bl[2]
+                moved[point, r] -= step
+                largest = max(largest, abs(step))
+            if largest < _LOCATED:
+                break
     return moved
