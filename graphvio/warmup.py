@@ -38,7 +38,7 @@ from graphvio.kernel_cache import any_compiled_before, cache_root
 from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_elsewhere
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
-from graphvio.monocular.estimator import adjust_no_keyframes
+from graphvio.monocular.warm_up import adjust_no_keyframes
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
 from graphvio.slam.landmarks import orientations

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.linear_algebra import cholesky
+from graphvio.linear_algebra import cholesky, solve_rows
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
@@ -54,6 +54,7 @@ class WindowCalibration:
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
         self.factors = self._first_factors = self.exact_factors
         self.log_bayes_factor = 0.0
+        self._files: dict[tuple[float, ...], Float] = {}
 
     @property
     def size(self) -> int:
@@ -81,7 +82,10 @@ class WindowCalibration:
         """Return the information (F, F) of a rig file that is wrong by some factors (G,), None where it is exact."""
         if (factors == EXACT).all():
             return None
-        return np.asarray(np.linalg.inv(self._prior.with_factors(factors)))
+        key = tuple(factors.tolist())
+        if key not in self._files:
+            self._files[key] = solve_rows(self._prior.with_factors(factors), np.eye(self.size))
+        return self._files[key]
 
     def is_plausible(self, difference: Float) -> bool:
         """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any."""
@@ -126,10 +130,7 @@ class WindowCalibration:
             biases: (6,) of the IMU.
             bias_covariance: (6, 6).
         """
-        factors = np.maximum(self.factors, _MIN_FACTOR)
-        if self.is_file_exact:
-            factors = np.ones_like(factors)
-        own = self._evidence.given(self._prior, factors)
+        own = self._evidence.given(self._prior, np.maximum(self.factors, _MIN_FACTOR))
         n = len(self._whole.covariance)
         mean, information, in_force = np.zeros(n), np.zeros((n, n)), np.zeros(n)
         mean[self._rows], mean[self._biases] = own.mean, biases
@@ -139,11 +140,6 @@ class WindowCalibration:
         return CalibrationEstimate(
             self._rig, Gaussian(mean, information), in_force, self.factors.copy(), self.log_bayes_factor
         )
-
-    @property
-    def file_covariance(self) -> Float:
-        """Covariance of all parameters, with the biases, by the rig file."""
-        return self._whole.covariance
 
 
 def time_offset_s(difference: Float) -> float:

@@ -16,7 +16,8 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.linear_algebra import product, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
-from graphvio.monocular.structure import Cameras, Structure
+from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.structure import Structure
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.preintegration import preintegrate

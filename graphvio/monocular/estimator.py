@@ -14,52 +14,43 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
 from graphvio.backend.initialisation import initial_attitude
-from graphvio.backend.states import RigState, StateCovariance, level_gravity, tilt_covariance
+from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
 from graphvio.config import Config
 from graphvio.geometry import se3, se3_inverse
-from graphvio.linear_algebra import solve_rows
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, Sighting, VisualResult
-from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import (
     Adjusted,
     Measurements,
-    Prior,
-    States,
     adjust,
     covariance_of,
     equations,
     evidence_of,
-    first_prior,
-    first_window,
     views_only,
-    without_first,
 )
 from graphvio.monocular.calibration import WindowCalibration, time_offset_s
 from graphvio.monocular.initialiser import (
     MAX_DURATION_NS,
     MAX_ERROR2,
     MAX_KEYFRAMES,
-    POSE_SIGMAS,
     Initialiser,
     Window,
     shared_points,
 )
+from graphvio.monocular.marginalisation import first_window, without_first
 from graphvio.monocular.overlap_trust import OverlapTrust, alone
 from graphvio.monocular.points import Solved, covariance_since, located_points
+from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
-from graphvio.monocular.structure import Cameras, Structure, located
+from graphvio.monocular.states import Prior, States
+from graphvio.monocular.structure import Structure
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.imu_model import PARAMETERS
-from graphvio.self_calibration.inertial import InertialSamples
-from graphvio.self_calibration.preintegration import preintegrate
-from graphvio.self_calibration.prior import file_prior
 
 _FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
@@ -525,25 +516,3 @@ class MonocularEstimator:
         if self._trust.oldest_ns is not None:
             oldest_ns = min(oldest_ns, max(self._trust.oldest_ns, stamp_ns - MAX_DURATION_NS))
         return oldest_ns
-
-
-def adjust_no_keyframes(rig: Rig) -> None:
-    """Call the kernels of the window, and of its calibration, without landmarks: they are then compiled or loaded."""
-    second = 1_000_000_000
-    stamps = np.arange(-second // 10, second, 5_000_000)
-    readings = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2], (len(stamps), 1))
-    keyframes = np.array([0, second // 10])
-    samples = InertialSamples(stamps, readings, keyframes, np.array([1e-3, 1e-2]), 50_000_000)
-    states = States(keyframes, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3)), level_gravity(), np.zeros(6))
-    prior = first_prior(states, np.ones(6), np.zeros(6), POSE_SIGMAS)
-    cameras = Cameras.of(rig)
-    structure = Structure(
-        np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros(2, dtype=np.int64), np.zeros((2, 2))
-    )
-    places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
-    adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)
-    covariance_of(np.eye(6), np.arange(6))
-    preintegrate(*samples[:2], 0, second // 10, np.zeros(PARAMETERS), samples.noise_densities, samples.max_gap_ns)
-    file_prior(rig)
-    for part in (np.eye(6), np.eye(9)[:6, :6]):  # whole, and a part of a larger matrix
-        solve_rows(part, np.zeros((3, 6)))

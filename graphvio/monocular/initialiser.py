@@ -18,11 +18,13 @@ from graphvio.errors import MeasurementError
 from graphvio.geometry import se3, se3_inverse
 from graphvio.measurements.motion import Sighting
 from graphvio.measurements.sensors import GRAVITY_M_S2
-from graphvio.monocular.adjustment import Adjusted, Measurements, Prior, States, adjust, first_prior, scale_sigma
+from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
+from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
-from graphvio.monocular.structure import Cameras, located
+from graphvio.monocular.states import Prior, States, first_prior
+from graphvio.monocular.structure import located
 from graphvio.self_calibration.inertial import InertialSamples
 
 MAX_KEYFRAMES = 14

@@ -9,8 +9,9 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.measurements.motion import LocatedPoints
-from graphvio.monocular.adjustment import BIASES, GRAVITY, Adjusted, covariance_of
+from graphvio.monocular.adjustment import Adjusted, covariance_of
 from graphvio.monocular.sightings import Views
+from graphvio.monocular.states import BIASES, GRAVITY
 from graphvio.monocular.structure import Structure
 
 _MIN_DEPTH_SIGMAS = 3.0  # a more uncertain inverse depth has no covariance in metres

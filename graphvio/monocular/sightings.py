@@ -14,7 +14,8 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.measurements.motion import Sighting
-from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Cameras, Structure
+from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Structure
 
 _NONE: Int = np.zeros(0, dtype=np.int64)
 _MIX = 2654435761  # of Knuth's multiplicative hash: lengths do not depend on the order of tracks

@@ -1,0 +1,93 @@
+"""Marginalisation: the first state of a window leaves, with the landmarks that it sees, and what it said stays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.linear_algebra import product, solve_rows
+from graphvio.measurements.window_views import FirstWindow
+from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements, times
+from graphvio.monocular.states import BIASES, GRAVITY, Prior, States, columns_of, inertial_columns, visual_columns
+from graphvio.monocular.structure import Eliminated, visual_equations
+from graphvio.self_calibration.inertial import InertialStates, inertial_equations
+
+
+def without_first(measured: Measurements, states: States, landmarks: Float, prior: Prior | None, walk: Float) -> Prior:
+    """Eliminate the first state of a window, with the landmarks that it sees.
+
+    Args:
+        measured: with the landmarks that the first state sees, and no others.
+        states: all K of the window.
+        landmarks: (L, 3).
+        prior: until now.
+        walk: (6 + F, 6 + F) lower Cholesky factor of the covariance of what biases and calibration change until the
+            second state.
+
+    Returns:
+        What is known of the other states.
+
+    Raises:
+        numpy.linalg.LinAlgError: if nothing determines the first state.
+    """
+    n, n_cameras, n_free = len(states.poses), states.n_cameras, len(states.calibration)
+    eliminated = Eliminated.empty(measured.structure, n_cameras)
+    visual_hessian, visual_gradient, _, _ = visual_equations(
+        states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
+        ROBUST_SCALE, eliminated,
+    )  # fmt: skip
+    size = 9 * n + GRAVITY + BIASES + n_free
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    of_views = visual_columns(n, n_cameras, n_free)
+    hessian[np.ix_(of_views, of_views)] += visual_hessian
+    gradient[of_views] += visual_gradient
+    if n > 1:
+        two = states.of(np.arange(2))
+        first = measured.samples._replace(keyframes_ns=measured.samples.keyframes_ns[:2])
+        inertial = inertial_equations(first, InertialStates(two.poses, two.velocities, two.gravity, two.parameters))
+        of_two = columns_of(n, np.arange(2), n_free)
+        columns = of_two[inertial_columns(2, n_cameras, n_free)]
+        known = len(columns)
+        hessian[np.ix_(columns, columns)] += inertial.hessian[:known, :known]
+        gradient[columns] += inertial.gradient[:known]
+    if 0 in measured.stationary:
+        at = 6 * n + np.arange(3)
+        hessian[at, at] += 1.0 / ZERO_VELOCITY_SIGMA**2
+        gradient[at] += states.velocities[0] / ZERO_VELOCITY_SIGMA**2
+    if prior is not None:
+        m = len(prior.at.poses)
+        off = states.of(np.arange(m)).since(prior.at)
+        columns = columns_of(n, np.arange(m), n_free)
+        hessian[np.ix_(columns, columns)] += prior.information
+        gradient[columns] += prior.gradient + times(prior.information, off)
+    leaving, kept = columns_of(n, np.arange(1))[:9], columns_of(n, np.arange(1, n), n_free)
+    gain = solve_rows(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(kept, leaving)])
+    if not np.isfinite(gain).all():
+        raise np.linalg.LinAlgError("the window's first state is not determined")
+    information = hessian[np.ix_(kept, kept)] - product(gain, hessian[np.ix_(leaving, kept)])
+    pulled = gradient[kept] - times(gain, gradient[leaving])
+    information, pulled = _walked(information, pulled, walk)
+    return Prior(states.of(np.arange(1, n)), 0.5 * (information + information.T), pulled)
+
+
+def first_window(prior: Prior) -> FirstWindow:
+    """Return what a prior says of poses, gravity, biases and the first velocity: of others it says nothing."""
+    n = len(prior.at.poses)
+    chosen = np.concatenate([np.arange(6 * n + 3), np.arange(9 * n, 9 * n + GRAVITY + BIASES)])
+    return FirstWindow(
+        prior.at.stamps_ns, prior.at.poses, prior.at.velocities[0], prior.at.gravity, prior.at.biases,
+        prior.information[np.ix_(chosen, chosen)], prior.gradient[chosen],
+    )  # fmt: skip
+
+
+def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Float]:
+    """Let the last unknowns, biases and calibration, walk: by a lower Cholesky factor of their covariance.
+
+    The change is an unknown of its own, which is eliminated; it has zero mean and, in these units, unit covariance.
+    """
+    size = len(walk)
+    by_change = product(np.ascontiguousarray(information[:, -size:]), walk)
+    of_change = product(np.ascontiguousarray(walk.T), np.ascontiguousarray(by_change[-size:])) + np.eye(size)
+    gain = solve_rows(of_change, by_change)
+    pull = times(walk.T, gradient[-size:])
+    return information - product(gain, np.ascontiguousarray(by_change.T)), gradient - times(gain, pull)

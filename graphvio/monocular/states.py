@@ -1,0 +1,133 @@
+"""States of a window and what is known of them from before, and where their unknowns are in a window's equations.
+
+Unknowns are ``[poses 6 K, velocities 3 K, gravity 3, gyro and accelerometer bias 6, calibration F]`` of K states; the
+landmarks are eliminated. Biases and calibration are the same in the whole window; they walk when a state leaves it. The
+calibration is ``[cameras C * SINGLE, IMU without its biases 19]``, see `graphvio.self_calibration.parameters`: the
+difference from the rig file, which is unknown, or taken for zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.geometry import so3_exp, so3_log
+from graphvio.monocular.reprojection import Cameras
+from graphvio.self_calibration.imu_model import PARAMETERS
+
+BIASES, GRAVITY = 6, 3
+_OTHER_IMU = PARAMETERS - BIASES
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """K states of a window, in time order.
+
+    Attributes:
+        stamps_ns: (K,).
+        poses: (K, 4, 4) ``odom_T_body``.
+        velocities: (K, 3) m/s, frame odom.
+        gravity: (3,) m/s^2, frame odom, downwards.
+        biases: (6,) of gyro, rad/s, and accelerometer, m/s^2.
+        calibration: (F,) difference from the rig file; empty where it is not estimated.
+    """
+
+    stamps_ns: Int
+    poses: Float
+    velocities: Float
+    gravity: Float
+    biases: Float
+    calibration: Float = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def parameters(self) -> Float:
+        """Parameters (25,) of the IMU, see `graphvio.self_calibration.imu_model`."""
+        other = self.calibration[-_OTHER_IMU:] if len(self.calibration) else np.zeros(_OTHER_IMU)
+        return np.concatenate([self.biases, other])
+
+    @property
+    def n_cameras(self) -> int:
+        """Number of the cameras' parameters."""
+        return max(len(self.calibration) - _OTHER_IMU, 0)
+
+    def cameras(self, of_file: Cameras) -> Cameras:
+        """Return the cameras, from those of the rig file."""
+        return of_file.moved(self.calibration[: self.n_cameras]) if self.calibration.any() else of_file
+
+    def of(self, kept: Int) -> States:
+        """Return some of the states, by their indices."""
+        return replace(self, stamps_ns=self.stamps_ns[kept], poses=self.poses[kept], velocities=self.velocities[kept])
+
+    def moved(self, step: Float) -> States:
+        """Return the states after a step of all unknowns, or of all but the calibration."""
+        n = len(self.poses)
+        poses = self.poses.copy()
+        for pose, of_pose in zip(poses, step[: 6 * n].reshape(n, 6), strict=True):
+            pose[:3, 3] += pose[:3, :3] @ of_pose[3:]
+            pose[:3, :3] = pose[:3, :3] @ so3_exp(of_pose[:3].copy())
+        velocities = step[6 * n : 9 * n].reshape(n, 3)
+        gravity, biases, calibration = np.split(step[9 * n :], [GRAVITY, GRAVITY + BIASES])
+        return replace(
+            self,
+            poses=poses,
+            velocities=self.velocities + velocities,
+            gravity=self.gravity + gravity,
+            biases=self.biases + biases,
+            calibration=self.calibration + calibration if len(calibration) else self.calibration,
+        )
+
+    def since(self, other: States) -> Float:
+        """Return the difference of all unknowns from other values of the same states."""
+        n = len(self.poses)
+        difference = np.empty(9 * n + GRAVITY + BIASES + len(self.calibration))
+        for k in range(n):
+            then_R_odom = other.poses[k, :3, :3].T
+            difference[6 * k : 6 * k + 3] = so3_log(np.ascontiguousarray(then_R_odom @ self.poses[k, :3, :3]))
+            difference[6 * k + 3 : 6 * k + 6] = then_R_odom @ (self.poses[k, :3, 3] - other.poses[k, :3, 3])
+        difference[6 * n : 9 * n] = (self.velocities - other.velocities).ravel()
+        common = (self.gravity - other.gravity, self.biases - other.biases, self.calibration - other.calibration)
+        difference[9 * n :] = np.concatenate(common)
+        return difference
+
+
+class Prior(NamedTuple):
+    """What is known of the first states of a window, of gravity, of the biases, and by them of the calibration.
+
+    Attributes:
+        at: the m states at which it was linearised.
+        information: (9 m + 9 + F, 9 m + 9 + F).
+        gradient: (9 m + 9 + F,) of the cost at these.
+    """
+
+    at: States
+    information: Float
+    gradient: Float
+
+
+def first_prior(states: States, bias_sigmas: Float, biases: Float, pose_sigmas: Float) -> Prior:
+    """Return what is known of a window's first state: its pose defines the frame; and of the biases."""
+    first, calibration = replace(states.of(np.arange(1)), biases=biases), np.zeros(len(states.calibration))
+    information = np.diag(np.concatenate([1.0 / pose_sigmas**2, np.zeros(6), 1.0 / bias_sigmas**2, calibration]))
+    return Prior(first, information, np.zeros(len(information)))
+
+
+def columns_of(n: int, states: Int, n_free: int = 0) -> Int:
+    """Return where ``[poses, velocities, gravity, biases, calibration]`` of some of n states are among all unknowns."""
+    poses = (6 * states[:, None] + np.arange(6)).ravel()
+    velocities = (6 * n + 3 * states[:, None] + np.arange(3)).ravel()
+    return np.concatenate([poses, velocities, 9 * n + np.arange(GRAVITY + BIASES + n_free)])
+
+
+def inertial_columns(n: int, n_cameras: int, n_free: int) -> Int:
+    """Return where the unknowns of `inertial_equations` are; where the calibration is known, of all but its last."""
+    known = 9 * n + GRAVITY + BIASES
+    return np.concatenate([np.arange(known), np.arange(known + n_cameras, known + n_free)])
+
+
+def visual_columns(n: int, n_cameras: int, n_free: int) -> Int:
+    """Return where the unknowns of `visual_equations` are: poses, and cameras unless the calibration is known."""
+    known = 9 * n + GRAVITY + BIASES
+    return np.concatenate([np.arange(6 * n), known + np.arange(n_cameras if n_free else 0)])

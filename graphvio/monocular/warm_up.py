@@ -1,0 +1,41 @@
+"""Kernels of single cameras, compiled or loaded before the first image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.backend.states import level_gravity
+from graphvio.linear_algebra import solve_rows
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.monocular.adjustment import Measurements, adjust, covariance_of
+from graphvio.monocular.initialiser import POSE_SIGMAS
+from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.states import States, first_prior
+from graphvio.monocular.structure import Structure, located
+from graphvio.rig import Rig
+from graphvio.self_calibration.imu_model import PARAMETERS
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.preintegration import preintegrate
+from graphvio.self_calibration.prior import file_prior
+
+
+def adjust_no_keyframes(rig: Rig) -> None:
+    """Call the kernels of the window, and of its calibration, without landmarks: they are then compiled or loaded."""
+    second = 1_000_000_000
+    stamps = np.arange(-second // 10, second, 5_000_000)
+    readings = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2], (len(stamps), 1))
+    keyframes = np.array([0, second // 10])
+    samples = InertialSamples(stamps, readings, keyframes, np.array([1e-3, 1e-2]), 50_000_000)
+    states = States(keyframes, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3)), level_gravity(), np.zeros(6))
+    prior = first_prior(states, np.ones(6), np.zeros(6), POSE_SIGMAS)
+    cameras = Cameras.of(rig)
+    structure = Structure(
+        np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros(2, dtype=np.int64), np.zeros((2, 2))
+    )
+    places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
+    adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)
+    covariance_of(np.eye(6), np.arange(6))
+    preintegrate(*samples[:2], 0, second // 10, np.zeros(PARAMETERS), samples.noise_densities, samples.max_gap_ns)
+    file_prior(rig)
+    for part in (np.eye(6), np.eye(9)[:6, :6]):  # whole, and a part of a larger matrix
+        solve_rows(part, np.zeros((3, 6)))
