@@ -810,3 +810,5 @@ def test_run_one_camera_of_euroc_from_a_moving_start(tmp_path: Path) -> None:
     assert ran.returncode == 0, ran.stderr
     error_mm = float(ran.stdout.partition("ATE rmse ")[2].partition(" mm")[0])
     assert error_mm < 15.0
+    kinds = [json.loads(line)["kind"] for line in (tmp_path / "out/events.jsonl").read_text().splitlines()]
+    assert EventKind.CALIBRATION_CORRECTED not in kinds  # the recording's calibration is a good one

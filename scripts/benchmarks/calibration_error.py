@@ -226,12 +226,7 @@ def _tables_of_pairs(report: Report, results: Mapping[Case, CalibrationOutcome])
         "with pose, %",
     ]
     report.table(head, rows)
-    if parameter_rows:
-        report.add(
-            "### Calibration parameters",
-            "Rms errors of the files -> of the rig that the odometry estimated with both pairs; medians of the draws.",
-        )
-        report.table(["scene", "level", "IMU", *_PARAMETERS.values()], parameter_rows)
+    _table_of_parameters(report, "with both pairs", ["scene", "level", "IMU", *_PARAMETERS.values()], parameter_rows)
 
 
 def _tables_of_singles(report: Report, results: Mapping[Case, CalibrationOutcome]) -> None:
@@ -263,12 +258,19 @@ def _tables_of_singles(report: Report, results: Mapping[Case, CalibrationOutcome
     )
     head = ["scene", "cameras", "level", "draws", "ATE, cm", "/ exact files", "pose NEES / 6", "with pose, %", "epochs"]
     report.table(head, rows)
-    if parameter_rows:
-        report.add(
-            "### Calibration parameters of single cameras",
-            "Rms errors of the files -> of the rig that the odometry estimated; medians of the draws.",
-        )
-        report.table(["scene", "cameras", "level", *_PARAMETERS_OF_SINGLES.values()], parameter_rows)
+    columns = ["scene", "cameras", "level", *_PARAMETERS_OF_SINGLES.values()]
+    _table_of_parameters(report, "with single cameras", columns, parameter_rows)
+
+
+def _table_of_parameters(report: Report, by: str, head: list[str], rows: list[list[str]]) -> None:
+    """Add what the odometry estimated by some cameras, unless all files were exact."""
+    if not rows:
+        return
+    report.add(
+        f"### Calibration parameters {by}",
+        "Rms errors of the files -> of the rig that the odometry estimated; medians of the draws.",
+    )
+    report.table(head, rows)
 
 
 def _level_text(level: int) -> str:
