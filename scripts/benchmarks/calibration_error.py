@@ -23,7 +23,11 @@ from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, Calibratio
 _SCENES = ("room", "corridor", "stairs", "calibration")
 _BOTH = "both"
 _PAIRS = {_BOTH: (0, 1), "front": (0,), "back": (1,)}
-_SINGLES = {"none": "each by itself", "one-camera": "the first one alone"}
+_SINGLES = {
+    "none": "each by itself",
+    "one-camera": "the first one alone",
+    "front+single": "the front pair and a single one to the back",
+}
 _ROUNDING = 1e-6
 _OUT = Path("results") / "benchmarks" / "calibration-error.csv"
 
@@ -56,7 +60,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         nargs="+",
         choices=[*_PAIRS, *_SINGLES],
         default=list(_PAIRS),
-        help="none: with the IMU, each camera by itself; one-camera: the first one alone (default: both front back)",
+        help="with the IMU, none: each camera by itself; one-camera: the first one alone; front+single: the front "
+        "pair, and a camera of the other one (default: both front back)",
     )
     imu = parser.add_mutually_exclusive_group()
     imu.add_argument("--no-imu", action="store_true", help="only runs without the IMU")
@@ -167,8 +172,9 @@ def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Itera
 
 def _selected(rig: Rig, case: Case) -> Rig:
     """Return the part of a rig that a case runs."""
-    if case.pairs == "one-camera":
-        return rig.with_only([rig.cameras[0].name])
+    n_cameras = {"one-camera": 1, "front+single": 3}.get(case.pairs)
+    if n_cameras is not None:
+        return rig.with_only([camera.name for camera in rig.cameras[:n_cameras]])
     chosen = rig.without_pairs() if case.pairs == "none" else rig.with_pairs(_PAIRS[case.pairs])
     return chosen if case.imu == "yes" else chosen.without_imu()
 
