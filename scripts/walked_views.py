@@ -8,7 +8,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.geometry import so3_log
 from graphvio.measurements.sensors import ImuSample
-from graphvio.rig import Rig
+from graphvio.rig import Rig, StereoPair
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, DISTORTION, PAIR, STEREO, RigCalibration
 from graphvio.self_calibration.window import View
@@ -52,13 +52,16 @@ class Walk:
         return pose
 
     def views(self, world_T_body: Float) -> dict[int, View]:
-        """Return what the pairs see."""
+        """Return what pairs and single cameras see."""
         body = np.linalg.inv(world_T_body)
         views = {}
-        for j, pair in enumerate(self.rig.pairs):
-            in_left = self._points @ (pair.left.cam_T_body @ body)[:3, :3].T + (pair.left.cam_T_body @ body)[:3, 3]
-            in_right = in_left @ pair.right_T_left[:3, :3].T + pair.right_T_left[:3, 3]
-            (left, seen), (right, matched) = pair.left.project(in_left), pair.right.project(in_right)
+        for j, group in enumerate(self.rig.groups):
+            in_left = self._points @ (group.left.cam_T_body @ body)[:3, :3].T + (group.left.cam_T_body @ body)[:3, 3]
+            left, seen = group.left.project(in_left)
+            right, matched = np.zeros_like(left), np.zeros_like(seen)
+            if isinstance(group, StereoPair):
+                in_right = in_left @ group.right_T_left[:3, :3].T + group.right_T_left[:3, 3]
+                right, matched = group.right.project(in_right)
             ids = np.flatnonzero(seen)[:_MAX_TRACKS]
             noise = self.sigma_px * self._rng.standard_normal((2, len(ids), 2))
             views[j] = View(ids, left[ids] + noise[0], right[ids] + noise[1], matched[ids], 1.0 / in_left[ids, 2])
@@ -87,7 +90,7 @@ class Walk:
 def true_difference(written: Rig, true: Rig) -> Float:
     """Return the true difference (C,) of the cameras' parameters from the written calibration."""
     nominal, exact = RigCalibration.of(written), RigCalibration.of(true)
-    rows = np.zeros((len(written.pairs), PAIR))
+    rows = np.zeros((len(written.groups), PAIR))
     for j in range(len(rows)):
         cameras = np.hstack(
             [exact.intrinsics[j] - nominal.intrinsics[j], (exact.distortion - nominal.distortion)[j, :, :DISTORTION]]
@@ -98,7 +101,7 @@ def true_difference(written: Rig, true: Rig) -> Float:
         rows[j, STEREO + 3 : BODY] = exact.right_T_left[j, :3, 3] - nominal.right_T_left[j, :3, 3]
         rows[j, BODY : BODY + 3] = so3_log(np.ascontiguousarray(exact.body_T_left[j, :3, :3] @ body_R.T))
         rows[j, BODY + 3 :] = exact.body_T_left[j, :3, 3] - nominal.body_T_left[j, :3, 3]
-    return rows.ravel()
+    return np.asarray(rows.ravel()[nominal.columns])
 
 
 def calibrated(calibration: SelfCalibration, walk: Walk, duration_s: float) -> SelfCalibration:

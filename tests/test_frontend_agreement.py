@@ -11,7 +11,6 @@ from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, _consensus_sets, _in_order, agree
-from graphvio.frontend.alignment import Place
 from graphvio.frontend.frozen import Frozen
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.pair_reports import pair_reports
@@ -41,8 +40,7 @@ def agreement_of(
 ) -> Agreement:
     rng = np.random.default_rng(seed)
     joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
-    places = {j: Place(covariance) for j, covariance in (uncertain or {}).items()}
-    return agree(arrays, seen, joint, CONFIG, rng, places, in_doubt)
+    return agree(arrays, seen, joint, CONFIG, rng, uncertain or {}, in_doubt)
 
 
 def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:

@@ -1,14 +1,12 @@
 """The watch on P_12: an error of the extrinsics is found from motions, and nothing where there is none."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import chdtri
 from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.alignment import PairAlignment, Place, combined, placed
+from graphvio.frontend.alignment import PairAlignment, combined, placed
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_exp, se3_log
 
@@ -150,47 +148,10 @@ def test_a_corrected_pair_counts_for_what_is_known_of_its_place(known_to: float,
         for each in reported:
             noisy = np.ascontiguousarray(se3_exp(noise * rng.standard_normal(6)) @ each)
             own.append(Refined(noisy, covariance, 0.5 * covariance, INLIER, ERRORS_PX))
-        found = combined(own[0], [placed(own[0], None), placed(own[1], Place(known_to**2 * np.eye(6)))])
+        found = combined(own[0], [placed(own[0], None), placed(own[1], known_to**2 * np.eye(6))])
         error = se3_log(np.ascontiguousarray(found.cur_T_ref @ np.linalg.inv(motion)))
         nees.append(error @ np.linalg.solve(found.covariance, error))
         sizes.append(np.linalg.det(found.covariance / noise**2) ** (1 / 6))
         assert np.linalg.eigvalsh(found.covariance - found.shared_covariance).min() > 0.0
     assert 5.5 < np.mean(nees) < 6.5  # 400 draws of 6 degrees of freedom: 6.0 +- 0.17
     assert size is None or np.mean(sizes) == pytest.approx(size, rel=0.05)
-
-
-def watch_with_prior(off: Float, count: int, seed: int, prior_sigma: float, noise_factor: float = 1.0) -> PairAlignment:
-    """A single camera's place, learnt as the front-end does it, from motions with more noise than they say."""
-    rng, alignment = np.random.default_rng(seed), PairAlignment(prior_sigma**2 * np.eye(6))
-    for _ in range(count):
-        motion = random_transform(rng, 0.15, 0.2)
-        correction = alignment.correction
-        seen = correction @ np.linalg.inv(se3_exp(off)) @ motion @ se3_exp(off) @ np.linalg.inv(correction)
-        noisy = refined(np.ascontiguousarray(seen), rng, 3e-4 * noise_factor)
-        own = replace(noisy, covariance=noisy.covariance / noise_factor**2)
-        alignment.add(refined(motion, rng, 3e-4), own)
-        alignment.learn()
-    return alignment
-
-
-def test_place_with_a_prior_is_uncertain_until_motions_have_tested_it() -> None:
-    assert watch_with_prior(NONE, 3, 0, 0.01).in_force is not None
-    trusted = [watch_with_prior(NONE, 20, seed, 0.01).in_force is None for seed in range(20)]
-    assert np.mean(trusted) > 0.6  # each of 15 tests errs once in 20, on nearly the same motions
-
-
-def test_place_with_a_prior_that_is_wrong_is_learnt_but_refuted_only_beyond_it() -> None:
-    within = 0.01 * np.array([0.8, -0.5, 0.3, -0.9, 0.6, 0.2])
-    for off, is_refuted in ((within, False), (10.0 * within, True)):
-        alignment = watch_with_prior(off, 40, 3, 0.01)
-        assert alignment.in_force is not None
-        error = alignment.in_force.tangent - off
-        assert error @ np.linalg.solve(alignment.in_force.covariance, error) < 22.5  # 99.9 % of 6 degrees of freedom
-        assert (alignment.refuted is not None) == is_refuted
-
-
-def test_motions_noisier_than_they_say_are_given_less_weight() -> None:
-    alignment = watch_with_prior(NONE, 60, 4, 0.01, noise_factor=5.0)
-    assert alignment.in_force is not None
-    assert 6.0 < alignment.in_force.dispersion < 30.0  # half of the noise is the trusted pair's: (25 + 1) / 2 = 13
-    assert alignment.refuted is None

@@ -61,12 +61,12 @@ def allowed(allowance: InnovationAllowance, estimator: MovingEstimator, referenc
 
 @pytest.mark.parametrize("refused", [0, 3])
 def test_innovation_allowance_is_for_the_way_since_vision_was_followed(refused: int) -> None:
-    allowance, estimator = InnovationAllowance(2), MovingEstimator()
+    allowance, estimator = InnovationAllowance(default_rig()), MovingEstimator()
     for k in range(10):
         stamp_ns = estimator.move(is_accepted=k < 10 - refused)
         allowance.add(stamp_ns, estimator, {0}, COVARIANCE)
     estimator.move(is_accepted=False)
-    found, errors = allowed(allowance, estimator, 0), InnovationErrors(COVARIANCE, 2)
+    found, errors = allowed(allowance, estimator, 0), InnovationErrors(COVARIANCE, default_rig())
     assert found is not None
     way = np.linalg.matrix_power(STEP, 1 + refused)
     without_time_offset = errors.covariance(way, None, None)
@@ -76,17 +76,17 @@ def test_innovation_allowance_is_for_the_way_since_vision_was_followed(refused: 
 
 
 def test_innovation_allowance_from_a_newer_reference_is_for_the_way_from_there() -> None:
-    allowance, estimator = InnovationAllowance(2), MovingEstimator()
+    allowance, estimator = InnovationAllowance(default_rig()), MovingEstimator()
     for k in range(6):
         allowance.add(estimator.move(is_accepted=k < 2), estimator, {0, 4 * STEP_NS}, COVARIANCE)
     found = allowed(allowance, estimator, 4 * STEP_NS)
     assert found is not None
-    of_step = InnovationErrors(COVARIANCE, 2).covariance(STEP, None, None)
+    of_step = InnovationErrors(COVARIANCE, default_rig()).covariance(STEP, None, None)
     np.testing.assert_allclose(found[:3, :3], of_step[:3, :3], rtol=0.05)
 
 
 def test_innovation_allowance_before_the_first_frameset_and_from_a_forgotten_state_is_none() -> None:
-    allowance, estimator = InnovationAllowance(2), MovingEstimator()
+    allowance, estimator = InnovationAllowance(default_rig()), MovingEstimator()
     estimator.move(is_accepted=True)
     assert allowed(allowance, estimator, 0) is None
     allowance.add(0, estimator, {0}, COVARIANCE)

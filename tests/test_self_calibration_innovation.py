@@ -9,6 +9,7 @@ from graphvio.geometry import se3, se3_exp, se3_inverse, se3_log, so3_exp, so3_l
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.innovation import InnovationErrors
 from graphvio.self_calibration.parameters import BODY, PAIR
+from graphvio.simulation.default_rig import default_rig
 
 IMU = 2 * PAIR
 MOTION = se3(so3_exp(np.array([0.1, -0.25, 0.2])), np.array([0.3, -0.1, 0.2]))
@@ -30,7 +31,7 @@ def assert_sampled(errors: Float, covariance: Float) -> None:
 
 def test_innovation_errors_of_the_place_in_body_are_those_of_motions_by_wrong_cameras() -> None:
     rng, sigmas = np.random.default_rng(1), np.repeat([0.01, 0.02], 3)
-    errors = InnovationErrors(covariance_with(BODY, np.diag(sigmas**2)), 2)
+    errors = InnovationErrors(covariance_with(BODY, np.diag(sigmas**2)), default_rig())
     found = [
         se3_log(se3_inverse(MOTION) @ se3_exp(d) @ MOTION @ se3_exp(-d)) for d in sigmas * rng.normal(size=(SAMPLES, 6))
     ]
@@ -40,7 +41,7 @@ def test_innovation_errors_of_the_place_in_body_are_those_of_motions_by_wrong_ca
 def test_innovation_errors_of_the_gyros_matrix_are_those_of_rates_by_a_wrong_matrix() -> None:
     rng, sigma, phi = np.random.default_rng(2), 0.01, so3_log(MOTION)
     root = sigma * (np.eye(9) + 0.3 * rng.normal(size=(9, 9)))
-    errors = InnovationErrors(covariance_with(IMU + GYRO_MATRIX, root @ root.T), 2)
+    errors = InnovationErrors(covariance_with(IMU + GYRO_MATRIX, root @ root.T), default_rig())
     assert GYRO_MATRIX + 9 == ACCEL_MATRIX
     matrices = (rng.normal(size=(SAMPLES, 9)) @ root.T).reshape(-1, 3, 3)
     found = np.zeros((SAMPLES, 6))
@@ -53,7 +54,7 @@ def test_innovation_errors_of_the_gyros_matrix_are_those_of_rates_by_a_wrong_mat
 def test_innovation_errors_of_the_time_offset_are_those_of_a_later_motion() -> None:
     before, now = np.array([0.2, -0.1, 0.4, 1.0, 0.3, 0.0]), np.array([0.9, 0.5, -0.2, 0.7, -0.2, 0.4])
     sigma_s = 0.004
-    errors = InnovationErrors(covariance_with(IMU + TIME_OFFSET, np.array([[sigma_s**2]])), 2)
+    errors = InnovationErrors(covariance_with(IMU + TIME_OFFSET, np.array([[sigma_s**2]])), default_rig())
     later = se3_inverse(se3_exp(sigma_s * before)) @ MOTION @ se3_exp(sigma_s * now)
     change = se3_log(se3_inverse(MOTION) @ later)
     expected = np.outer(change, change)
@@ -62,5 +63,5 @@ def test_innovation_errors_of_the_time_offset_are_those_of_a_later_motion() -> N
 
 
 def test_innovation_errors_of_a_standstill_are_none() -> None:
-    errors = InnovationErrors(0.01 * np.eye(IMU + PARAMETERS), 2)
+    errors = InnovationErrors(0.01 * np.eye(IMU + PARAMETERS), default_rig())
     np.testing.assert_allclose(errors.covariance(np.eye(4), np.zeros(6), np.zeros(6)), 0.0, atol=1e-15)

@@ -12,9 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
-from graphvio.arrays import Bool
+from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.alignment import Place, combined, placed
+from graphvio.frontend.alignment import combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
@@ -23,7 +23,7 @@ from graphvio.geometry import se3_compose, se3_inverse, se3_log
 from graphvio.linear_algebra import squared_length
 
 _T = THRESHOLDS.agreement
-_NONE: Mapping[int, Place] = {}
+_NONE: Mapping[int, Float] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def agree(
     joint: Refined,
     config: MotionConfig,
     rng: np.random.Generator,
-    uncertain: Mapping[int, Place] = _NONE,
+    uncertain: Mapping[int, Float] = _NONE,
     in_doubt: bool = False,
 ) -> Agreement:
     """Compare the pairs' own motions, and return the motion of each consensus set.
@@ -79,8 +79,8 @@ def agree(
         joint: `graphvio.frontend.selection.joint_motion` of these.
         config: Configuration of the motion stage.
         rng: Source of random triples.
-        uncertain: Pair index -> how well its extrinsics are known, of pairs whose extrinsics have been corrected or are
-            not known exactly.
+        uncertain: Pair index -> covariance (6, 6) of an error d of its extrinsics, which are ``exp(d) body_T_left``, of
+            pairs whose extrinsics have been corrected or are not known exactly.
         in_doubt: Whether the pairs contradicted each other a moment ago: a smaller distance then separates them.
     """
     everyone = observations.pairs
@@ -187,7 +187,7 @@ def _hypothesis(
     pairs: list[int],
     own: Mapping[int, Refined],
     placed_motions: Mapping[int, Refined],
-    uncertain: Mapping[int, Place],
+    uncertain: Mapping[int, Float],
     config: MotionConfig,
 ) -> MotionHypothesis:
     """Return the motion of a consensus set."""

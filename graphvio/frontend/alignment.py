@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from graphvio.arrays import Float
 from graphvio.frontend.refinement import Refined
@@ -23,19 +22,6 @@ from graphvio.kernels import kernel
 from graphvio.rig import Rig
 
 _T = THRESHOLDS.alignment
-_MEDIAN_DISTANCE = float(chdtri(6, 0.5))
-
-
-class Place(NamedTuple):
-    """How well the extrinsics of a pair or single camera are known.
-
-    Attributes:
-        covariance: (6, 6) of an error d of its extrinsics, which are ``exp(d) body_T_left``.
-        dispersion: Squared errors that its motions have shown, over those that their covariances say; at least 1.
-    """
-
-    covariance: Float
-    dispersion: float = 1.0
 
 
 class Misalignment(NamedTuple):
@@ -45,22 +31,11 @@ class Misalignment(NamedTuple):
         tangent: (6,) ``[rotation, translation]`` d: the true ``body_T_left`` is ``exp(d)`` times the assumed one.
         covariance: (6, 6) of d.
         statistic: Chi-square (6 degrees of freedom) of d being zero.
-        dispersion: See `Place`.
     """
 
     tangent: Float
     covariance: Float
     statistic: float
-    dispersion: float = 1.0
-
-    @property
-    def place(self) -> Place:
-        """How well the extrinsics are known with this error corrected."""
-        return Place(self.covariance, self.dispersion)
-
-    def contradicts(self, prior: Float) -> bool:
-        """Whether an error with the prior covariance (6, 6) explains it less than once in 10^9."""
-        return float(self.tangent @ np.linalg.solve(prior + self.covariance, self.tangent)) > _T.max_chance_distance
 
     def refutes(self, other: Misalignment) -> bool:
         """Whether the other error is significantly different."""
@@ -71,27 +46,15 @@ class Misalignment(NamedTuple):
 class PairAlignment:
     """Estimates the error of a pair's extrinsics relative to another pair, from the motions of both.
 
-    Args:
-        prior: Covariance (6, 6) of the error as far as it is known beforehand, or None where the extrinsics are taken
-            as they are unless chance explains an error less than once in 10^9. With a prior they are that uncertain
-            until motions have tested them, and once in 20 is enough: the estimate is better then.
+    The extrinsics are taken as they are unless chance explains an error less than once in 10^9.
 
     Attributes:
         in_force: The error that the pair's motions are corrected for from now on, or None.
     """
 
-    def __init__(self, prior: Float | None = None) -> None:
-        self._prior = prior
+    def __init__(self) -> None:
         self._motions: deque[tuple[Float, Float, Float]] = deque(maxlen=_T.max_motions)  # trusted, the pair's, whitener
-        self.in_force = None if prior is None else Misalignment(np.zeros(6), prior, 0.0)
-        self._is_learnt = False
-
-    @property
-    def refuted(self) -> Misalignment | None:
-        """The error in force if it is larger than what was known beforehand allows, else None."""
-        if self.in_force is None or (self._prior is not None and not self.in_force.contradicts(self._prior)):
-            return None
-        return self.in_force
+        self.in_force: Misalignment | None = None
 
     @property
     def correction(self) -> Float:
@@ -110,10 +73,6 @@ class PairAlignment:
         found = self.solve()
         if found is None:
             return False
-        if self._prior is not None:
-            self._is_learnt |= found.statistic > _T.max_usual_distance or found.dispersion > 1.0
-            was_in_force, self.in_force = self.in_force, found if self._is_learnt else None
-            return self.in_force is not None or was_in_force is not None
         if found.statistic > _T.max_chance_distance:
             self.in_force = found
             return True
@@ -127,7 +86,7 @@ class PairAlignment:
         if len(self._motions) < _T.min_motions:
             return None
         trusted, pairs, whiteners = (np.array(column) for column in zip(*self._motions, strict=True))
-        prior = np.diag(1.0 / _T.prior_sigmas**2) if self._prior is None else np.linalg.inv(self._prior)
+        prior = np.diag(1.0 / _T.prior_sigmas**2)
         d = np.zeros(6) if self.in_force is None else self.in_force.tangent
         information = prior
         for _ in range(_T.iterations):
@@ -137,16 +96,9 @@ class PairAlignment:
             information = prior + np.einsum("n,nki,nkj->ij", weights, derivatives, derivatives)
             gradient = prior @ d + np.einsum("n,nki,nk->i", weights, derivatives, errors)
             d = d - np.linalg.solve(information, gradient)
-        shown = information - prior
-        if self._prior is not None:
-            dispersion = max(1.0, float(np.median(squared)) / _MEDIAN_DISTANCE)
-            if dispersion < _T.min_dispersion:
-                dispersion = 1.0
-            covariance = np.asarray(np.linalg.inv(prior + shown / dispersion))
-            return Misalignment(d, covariance, float(d @ shown @ d) / dispersion, dispersion)
         if np.mean(squared > 4.0 * _T.cauchy_scale) > _T.max_outlier_share:
             return None
-        return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ shown @ d))
+        return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
 
 def learn_from_nothing(motion: Refined) -> None:
@@ -178,12 +130,12 @@ def describe(rig: Rig, pair: int, misalignment: Misalignment) -> str:
     )
 
 
-def placed(motion: Refined, place: Place | None) -> Refined:
-    """Enlarge the covariance of a pair's motion by that of its extrinsics."""
-    if place is None:
+def placed(motion: Refined, of_place: Float | None) -> Refined:
+    """Enlarge the covariance of a pair's motion by that of its extrinsics (6, 6), None where these are exact."""
+    if of_place is None:
         return motion
     lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
-    return replace(motion, covariance=place.dispersion * motion.covariance + lever @ place.covariance @ lever.T)
+    return replace(motion, covariance=motion.covariance + lever @ of_place @ lever.T)
 
 
 def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:

@@ -18,6 +18,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.kernels import kernel
+from graphvio.rig import Camera
 
 PRIOR_INVERSE_DEPTH = 0.2
 _PRIOR_SIGMA = 10.0  # 1/m: next to nothing is known
@@ -63,6 +64,14 @@ class MotionHistory:
         self.restart(now_ns)
         self._since = since | self._since
 
+    def recalibrate(self, new_T_old: Float) -> None:
+        """Take another body frame (4, 4), in which the cameras' motions are the same and body's are others."""
+        old_T_new, adjoint = se3_inverse(new_T_old), se3_adjoint(np.ascontiguousarray(new_T_old))
+        self._since = {
+            ns: Since(new_T_old @ each.cur_T_then @ old_T_new, adjoint @ each.covariance @ adjoint.T, each.keyframes)
+            for ns, each in self._since.items()
+        }
+
     def restart(self, now_ns: int) -> None:
         """Begin with a keyframe whose motion since the others is not known."""
         self._since = {now_ns: Since(np.eye(4), np.zeros((6, 6)), 0)}
@@ -80,6 +89,12 @@ class FirstSights:
         self._ids: Int = np.zeros(0, dtype=np.int64)
         self._stamps_ns: Int = np.zeros(0, dtype=np.int64)
         self._rays: Float = np.zeros((0, 2))
+
+    def recalibrate(self, then: Camera, now: Camera) -> None:
+        """Take another calibration of the camera, by which the same pixels have other normalised coordinates."""
+        pixels, is_seen = then.project(np.column_stack([self._rays, np.ones(len(self._rays))]))
+        rays, has_ray = now.unproject(pixels)
+        self._rays = np.where((is_seen & has_ray)[:, None], rays, self._rays)
 
     def locate(
         self, ids: Int, rays: Float, history: MotionHistory, body_T_cam: Float, focal_px: float, sigma_px: float

@@ -97,8 +97,6 @@ class AlignmentThresholds:
         max_outlier_share: Of the motions; with more, there is no common error.
         prior_sigmas: (6,) rad and m: decides only in directions that no motion shows.
         max_chance_distance: Chi-square that a right transform exceeds once in 10^9.
-        max_usual_distance: Chi-square that a right transform exceeds once in 20.
-        min_dispersion: Smaller ones of a single camera's motions are taken for chance.
         max_vague_share: A size is reported where its standard deviation is at most this share of it.
         max_fine_rad: Or, of an angle, where it is at most this.
         max_fine_m: Or, of a distance, where it is at most this.
@@ -111,8 +109,6 @@ class AlignmentThresholds:
     max_outlier_share: float = 0.3
     prior_sigmas: np.ndarray[tuple[int], np.dtype[np.float64]] = field(default_factory=lambda: np.repeat([0.1, 0.2], 3))
     max_chance_distance: float = float(chdtri(6, 1e-9))
-    max_usual_distance: float = float(chdtri(6, 0.05))
-    min_dispersion: float = 2.0
     max_vague_share: float = 0.25
     max_fine_rad: float = float(np.deg2rad(0.2))
     max_fine_m: float = 0.01

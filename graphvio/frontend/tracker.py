@@ -167,9 +167,11 @@ class PairTracker:
 
     def recalibrate(self, pair: CameraGroup, epipolar_margin_px: float) -> None:
         """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
-        self._pair = pair
-        if self._matcher is not None and isinstance(pair, StereoPair):
+        if self._matcher is None:
+            self._first_sights.recalibrate(self._pair.left, pair.left)
+        elif isinstance(pair, StereoPair):
             self._matcher.recalibrate(pair, epipolar_margin_px)
+        self._pair = pair
         self._patches.recalibrate(pair)
         self._last = self._last.recalibrated(pair)
 

@@ -101,9 +101,10 @@ class PairFrame:
 
     def recalibrated(self, pair: CameraGroup) -> PairFrame:
         """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
-        if isinstance(pair, SingleCamera):
-            return self  # such a camera's lens is not calibrated while it runs
         left, has_ray = pair.left.unproject(self.pixels_at_stamp)
+        if isinstance(pair, SingleCamera):
+            points = np.column_stack([left, self.points[:, 2]])
+            return replace(self, left=left, points=points, has_depth=self.has_depth & has_ray)
         right, in_right = pair.right.unproject(self.right_pixels_at_stamp)
         points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
         has_depth = self.has_depth & has_ray & in_right

@@ -139,8 +139,11 @@ class VisualFrontend:
         Args:
             rig: with the calibration.
             epipolar_margin_px: by how much it may move epipolar lines, added to what matches may be off.
-            uncertain: pair index -> covariance (6, 6) of its extrinsics relative to the first pair, see `agree`.
+            uncertain: index of a pair or single camera -> covariance (6, 6) of its extrinsics relative to the first
+                pair, see `agree`.
         """
+        new_T_old = rig.pairs[0].left.body_T_cam @ self._rig.pairs[0].left.cam_T_body
+        self._history.recalibrate(new_T_old)
         self._rig = rig
         self._baselines_m = _baselines_m(rig)
         self._places.recalibrate(rig, uncertain)

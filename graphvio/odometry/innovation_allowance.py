@@ -11,6 +11,7 @@ from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.motion import RelativeMotion, VisualResult
+from graphvio.rig import Rig
 from graphvio.self_calibration.innovation import InnovationErrors
 
 
@@ -21,11 +22,11 @@ class InnovationAllowance:
     they add since vision last constrained the state, mostly over one step.
 
     Args:
-        n_pairs: Number of stereo pairs, to which the covariance of the calibration belongs.
+        rig: To which the covariance of the calibration belongs.
     """
 
-    def __init__(self, n_pairs: int) -> None:
-        self._n_pairs = n_pairs
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
         self._errors: InnovationErrors | None = None
         self._covariance: Float | None = None
         self._followed_ns = -1  # the newest frameset whose motion passed the test
@@ -43,7 +44,7 @@ class InnovationAllowance:
             covariance: (C, C) of the calibration that the state has followed until then.
         """
         if self._covariance is not covariance:
-            self._covariance, self._errors = covariance, InnovationErrors(covariance, self._n_pairs)
+            self._covariance, self._errors = covariance, InnovationErrors(covariance, self._rig)
         gate_result = estimator.gate_results.get("vision")
         if gate_result is not None and gate_result.accepted:
             self._followed_ns = stamp_ns

@@ -62,7 +62,7 @@ class OnlineCalibration:
             self._margin_px = self._epipolar_margin_px()
             frontend.recalibrate(rig, self._margin_px)
         has_allowance = self._calibration is not None and rig.imu is not None
-        self._allowance = InnovationAllowance(len(rig.pairs)) if has_allowance else None
+        self._allowance = InnovationAllowance(rig) if has_allowance else None
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
@@ -111,9 +111,8 @@ class OnlineCalibration:
             self._epoch = estimator.epoch
             self._calibration.start_window()
         views = {
-            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_depth, frame.points[:, 2])
+            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
             for j, frame in self._frontend.frames_at(stamp_ns).items()
-            if not frame.is_single
         }
         self._calibration.add_frameset(stamp_ns, estimator.state().nav_T_body, views, quality is Quality.WEAK)
 

@@ -8,7 +8,7 @@ from graphvio.arrays import Float
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
-from graphvio.self_calibration.parameters import PAIR, RigCalibration
+from graphvio.self_calibration.parameters import RigCalibration
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, choose_tracks, stationary
 
@@ -41,7 +41,7 @@ def adjusted(
     """
     poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
     stamps_s = np.array([(keyframe.stamp_ns - keyframes[0].stamp_ns) * 1e-9 for keyframe in keyframes])
-    calibration = nominal.moved(difference[: PAIR * len(nominal.models)])
+    calibration = nominal.moved(difference[: len(nominal.columns)])
     tracks, landmarks = choose_tracks(keyframes, poses, calibration, _MAX_TRACKS)
     positions = poses[:, :3, 3]
     velocities = np.gradient(positions, stamps_s, axis=0) if len(poses) > 1 else np.zeros_like(positions)

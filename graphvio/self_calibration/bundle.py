@@ -37,7 +37,7 @@ class Tracks(NamedTuple):
     """Observations of L landmarks in K keyframes: N rows, sorted by landmark.
 
     Attributes:
-        pair: (L,) index of the pair that sees each landmark.
+        pair: (L,) index of the pair or single camera that sees each landmark.
         odom_T_landmark: (L, 4, 4) fixed frame of each.
         rows: (L + 1,) the observations of landmark l are ``rows[l]`` to ``rows[l + 1]``.
         keyframe: (N,) index.

@@ -15,14 +15,12 @@ from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, PARAM
 from graphvio.self_calibration.parameters import (
     CAMERA,
     INTRINSICS,
-    PAIR,
-    SINGLE,
     STEREO,
-    first_place,
     is_linear,
     n_of_cameras,
+    place_of,
     relative_to_first,
-    single_cameras,
+    slices_of_groups,
 )
 
 _DEG = float(np.rad2deg(1.0))
@@ -77,11 +75,10 @@ def with_sigma(value: float, sigma: float) -> str:
 def _of_cameras(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
     lenses = [
-        (camera, j * PAIR + which * CAMERA)
-        for j, pair in enumerate(rig.pairs)
-        for which, camera in enumerate(pair.cameras)
+        (camera, own.start + which * CAMERA)
+        for group, own in zip(rig.groups, slices_of_groups(rig), strict=True)
+        for which, camera in enumerate(group.cameras)
     ]
-    lenses += [(camera, j * SINGLE) for j, camera in enumerate(single_cameras(rig))]
     for camera, at in lenses:
         for i, axis in enumerate("xy"):
             focal = 100.0 / camera.intrinsics[i]
@@ -93,18 +90,18 @@ def _of_cameras(rig: Rig) -> Iterator[Curve]:
 
 def _of_singles(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
-    for j, camera in enumerate(single_cameras(rig)[1:], start=1):
+    against = f"cameras against {rig.groups[0].name}"
+    for j, single in enumerate(rig.singles, start=len(rig.pairs)):
         relative = relative_to_first(rig, j) @ unit[: n_of_cameras(rig)]
-        against = f"cameras against {rig.singles[0].name}"
-        for i, axis in enumerate(_AXES):
-            yield Curve(f"{against}, rotation", "deg", camera.name, axis, _DEG * relative[i])
-            yield Curve(f"{against}, translation", "mm", camera.name, axis, 1e3 * relative[3 + i])
+        for i, axis in enumerate(_AXES if j > 0 else ()):
+            yield Curve(f"{against}, rotation", "deg", single.name, axis, _DEG * relative[i])
+            yield Curve(f"{against}, translation", "mm", single.name, axis, 1e3 * relative[3 + i])
 
 
 def _of_pairs(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
     for j, pair in enumerate(rig.pairs):
-        stereo = unit[j * PAIR + STEREO :]
+        stereo = unit[slices_of_groups(rig)[j]][STEREO:]
         relative = relative_to_first(rig, j) @ unit[: n_of_cameras(rig)]
         for i, axis in enumerate(_AXES):
             yield Curve("left to right, rotation", "deg", pair.name, axis, _DEG * stereo[i])
@@ -120,7 +117,7 @@ def _of_imu(rig: Rig) -> Iterator[Curve]:
     if rig.imu is None:
         return
     unit = np.eye(_size(rig))
-    imu, place = unit[n_of_cameras(rig) :], unit[first_place(rig)]
+    imu, place = unit[n_of_cameras(rig) :], unit[place_of(rig, 0)]
     for i, axis in enumerate(_AXES):
         yield Curve("cameras to IMU, rotation", "deg", "", axis, _DEG * place[i])
         yield Curve("cameras to IMU, translation", "mm", "", axis, 1e3 * place[3 + i])

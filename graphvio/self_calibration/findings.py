@@ -9,20 +9,18 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphvio.arrays import Float
-from graphvio.rig import Camera
+from graphvio.rig import Camera, StereoPair
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
 from graphvio.self_calibration.parameters import (
     BODY,
     CAMERA,
     INTRINSICS,
-    PAIR,
-    SINGLE,
     STEREO,
-    first_place,
     n_of_cameras,
+    place_of,
     relative_to_first,
-    single_cameras,
+    slices_of_groups,
 )
 from graphvio.self_calibration.prior import SINGLE_CENTRE_PX, SINGLE_FOCAL_SHARE
 
@@ -119,29 +117,25 @@ def described(found: list[Finding]) -> list[str]:
 def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Float, float, str]]:
     """Yield name, unit, factor to it, rows (N, C) of the difference, smallest error in the unit, and motion."""
     rig, whole = estimate.file_rig, np.eye(len(estimate.difference))
-    deg = float(np.rad2deg(1.0))
-    for j, pair in enumerate(rig.pairs):
-        at = j * PAIR
-        for which, camera in enumerate(pair.cameras):
-            yield from _of_lens(camera, whole[at + which * CAMERA :], 0.05, 0.3)
-        stereo, body = at + STEREO, at + BODY
-        name = f"pair {pair.name}"
-        yield f"{name}, rotation left to right", "deg", deg, whole[stereo : stereo + 3], 0.005, _DEPTHS
-        yield f"{name}, translation left to right", "mm", 1e3, whole[stereo + 3 : body], 0.1, SCALE_MOTION
+    deg, first = float(np.rad2deg(1.0)), rig.groups[0].name
+    for j, (group, of_group) in enumerate(zip(rig.groups, slices_of_groups(rig), strict=True)):
+        own = whole[of_group]
+        if isinstance(group, StereoPair):
+            name = f"pair {group.name}"
+            for which, camera in enumerate(group.cameras):
+                yield from _of_lens(camera, own[which * CAMERA :], 0.05, 0.3)
+            yield f"{name}, rotation left to right", "deg", deg, own[STEREO : STEREO + 3], 0.005, _DEPTHS
+            yield f"{name}, translation left to right", "mm", 1e3, own[STEREO + 3 : BODY], 0.1, SCALE_MOTION
+        else:
+            name = f"camera {group.name}"
+            yield from _of_lens(group.left, own, 100.0 * SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX)
         if j > 0:
-            relative = relative_to_first(rig, j) @ whole[: n_of_cameras(rig)]
-            yield f"{name}, rotation against {rig.pairs[0].name}", "deg", deg, relative[:3], 0.03, _TURN
-            yield f"{name}, translation against {rig.pairs[0].name}", "mm", 1e3, relative[3:], 3.0, _TURN
-    for j, camera in enumerate(single_cameras(rig)):
-        yield from _of_lens(camera, whole[j * SINGLE :], 100.0 * SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX)
-        if j > 0:
-            name, first = f"camera {camera.name}", rig.singles[0].name
             relative = relative_to_first(rig, j) @ whole[: n_of_cameras(rig)]
             yield f"{name}, rotation against {first}", "deg", deg, relative[:3], 0.03, _TURN
             yield f"{name}, translation against {first}", "mm", 1e3, relative[3:], 3.0, _TURN
     if rig.imu is None:
         return
-    at, place = n_of_cameras(rig), whole[first_place(rig)]
+    at, place = n_of_cameras(rig), whole[place_of(rig, 0)]
     yield "cameras to IMU, rotation", "deg", deg, place[:3], 0.1, _TURN
     yield "cameras to IMU, translation", "mm", 1e3, place[3:], 3.0, _TURN
     yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN

@@ -6,8 +6,9 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
+from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import BODY, PAIR
+from graphvio.self_calibration.parameters import n_of_cameras, place_of
 
 
 class InnovationErrors:
@@ -19,13 +20,13 @@ class InnovationErrors:
     The three are taken as independent.
 
     Args:
-        covariance: (C, C) of the calibration, of N pairs and an IMU.
-        n_pairs: N.
+        covariance: (C, C) of the calibration of the cameras and the IMU.
+        rig: That it belongs to.
     """
 
-    def __init__(self, covariance: Float, n_pairs: int) -> None:
-        imu = covariance[PAIR * n_pairs :, PAIR * n_pairs :]
-        self._of_place = covariance[BODY:PAIR, BODY:PAIR]
+    def __init__(self, covariance: Float, rig: Rig) -> None:
+        imu = covariance[n_of_cameras(rig) :, n_of_cameras(rig) :]
+        self._of_place = covariance[place_of(rig, 0), place_of(rig, 0)]
         self._of_matrix = imu[GYRO_MATRIX:ACCEL_MATRIX, GYRO_MATRIX:ACCEL_MATRIX].reshape(3, 3, 3, 3)
         self._of_time_offset = float(imu[TIME_OFFSET, TIME_OFFSET])
 

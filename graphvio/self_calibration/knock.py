@@ -9,7 +9,8 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.cameras import central_scale, unproject_pixels
 from graphvio.geometry import skew
-from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration
+from graphvio.rig import Rig
+from graphvio.self_calibration.parameters import STEREO, RigCalibration, place_of, slices_of_groups
 from graphvio.self_calibration.window import View
 
 _MIN_MATCHES = 30
@@ -57,14 +58,15 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
     return float(abs(np.median(distances)) * calibration.intrinsics[pair, 1, 0] * scale)
 
 
-def knock_covariance(n_parameters: int, pairs: Iterable[int]) -> Float:
-    """Return the covariance (C, C) of what a knock does to some pairs.
+def knock_covariance(rig: Rig, n_parameters: int, groups: Iterable[int]) -> Float:
+    """Return the covariance (C, C) of what a knock does to some pairs and single cameras.
 
     It turns and shifts cameras, and leaves lenses and IMU. A housing bends; its length, and so the baseline, stays.
     """
     variances = np.zeros(n_parameters)
-    for j in pairs:
-        of_pair = variances[j * PAIR : (j + 1) * PAIR]
-        of_pair[STEREO : STEREO + 3] = of_pair[BODY : BODY + 3] = _TURNED_RAD**2
-        of_pair[BODY + 3 : PAIR] = _MOVED_M**2
+    for j in groups:
+        own, place = variances[slices_of_groups(rig)[j]], variances[place_of(rig, j)]
+        if j < len(rig.pairs):
+            own[STEREO : STEREO + 3] = _TURNED_RAD**2
+        place[:3], place[3:] = _TURNED_RAD**2, _MOVED_M**2
     return np.diag(variances)

@@ -26,7 +26,7 @@ from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaus
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
-from graphvio.self_calibration.parameters import PAIR, RigCalibration
+from graphvio.self_calibration.parameters import RigCalibration, n_of_cameras
 from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe, View, median_displacement_px
@@ -104,7 +104,7 @@ class SelfCalibration:
 
     Attributes:
         estimate: what is known now.
-        extrinsics: pair index -> covariance (6, 6) of its place relative to the first pair, see
+        extrinsics: index of a pair or single camera -> covariance (6, 6) of its place relative to the first pair, see
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         widest: (C, C) covariance of what is known, if the file may be as wrong as any.
@@ -167,7 +167,7 @@ class SelfCalibration:
         Args:
             stamp_ns: of the frameset.
             odom_T_body: (4, 4) its estimated pose.
-            views: pair index -> tracks.
+            views: index of the pair or single camera -> tracks.
             are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
                 did, and the scene if they once agreed.
         """
@@ -244,7 +244,7 @@ class SelfCalibration:
     @property
     def _n_cameras(self) -> int:
         """Number of the cameras' parameters, the first ones of all."""
-        return PAIR * len(self._rig.pairs)
+        return n_of_cameras(self._rig)
 
     @property
     def is_confirmed(self) -> bool:
@@ -259,14 +259,14 @@ class SelfCalibration:
         """Leave a window out that contradicts those before it; several such windows are a knock."""
         self._refused += is_full
         if self._refused >= _MAX_REFUSED:
-            self._forget_places(range(len(self._rig.pairs)))
+            self._forget_places(range(len(self._rig.groups)))
 
-    def _forget_places(self, pairs: Iterable[int]) -> None:
-        """Begin again after a knock of some pairs, with what was known of the others, of lenses and IMU."""
+    def _forget_places(self, groups: Iterable[int]) -> None:
+        """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
         if self._pending is not None:
             wait([self._pending])  # it is of a window from before the knock, and reads what changes now
             self._pending = None
-        change = knock_covariance(len(self._walk), pairs)
+        change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
         self._keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self.has_full_window, self._agreeing, self._refused = False, 0, 0

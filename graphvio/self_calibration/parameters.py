@@ -5,7 +5,7 @@ others, are kept: see `graphvio.cameras.LINEAR_COEFFICIENTS`.
 
 A vector is the difference from the nominal rig, that of the rig file. Rotations are rotation vectors: that of the right
 camera turns the left camera's frame, ``right_R_left Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
-Single cameras have parameters in a rig without pairs, and none beside pairs.
+Those of pairs come first, those of single cameras follow.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _MATRIX = tuple(f"{row}{column}" for row in _AXES for column in _AXES)
 def parameter_names(rig: Rig) -> list[str]:
     """Return the names of a rig's parameters, in their order: of its cameras, and of its IMU if there is one."""
     names = []
-    for camera in single_cameras(rig):
-        names += [f"{camera.name}.{name}" for name in _CAMERA_NAMES]
-        names += [f"{camera.name}.body_T_cam.{kind}{axis}" for kind in ("r", "t") for axis in _AXES]
     for pair in rig.pairs:
         names += [f"{camera.name}.{name}" for camera in (pair.left, pair.right) for name in _CAMERA_NAMES]
         for transform in ("right_T_left", "body_T_left"):
             names += [f"{pair.name}.{transform}.{kind}{axis}" for kind in ("r", "t") for axis in _AXES]
+    for single in rig.singles:
+        names += [f"{single.left.name}.{name}" for name in _CAMERA_NAMES]
+        names += [f"{single.left.name}.body_T_cam.{kind}{axis}" for kind in ("r", "t") for axis in _AXES]
     if rig.imu is not None:
         names += [f"imu.{sensor}_bias.{axis}" for sensor in ("gyro", "accel") for axis in _AXES]
         names += [f"imu.{sensor}_matrix.{element}" for sensor in ("gyro", "accel") for element in _MATRIX]
@@ -51,37 +51,27 @@ def parameter_names(rig: Rig) -> list[str]:
     return names
 
 
-def single_cameras(rig: Rig) -> list[Camera]:
-    """Return the single cameras that have parameters: those of a rig without pairs."""
-    return [] if rig.pairs else [single.left for single in rig.singles]
-
-
 def n_of_cameras(rig: Rig) -> int:
     """Return the number of a rig's parameters without those of its IMU."""
-    return PAIR * len(rig.pairs) + SINGLE * len(single_cameras(rig))
+    return PAIR * len(rig.pairs) + SINGLE * len(rig.singles)
 
 
-def first_place(rig: Rig) -> slice:
-    """Return where the parameters (6,) of the place of the first pair, or single camera, in body are."""
-    end = PAIR if rig.pairs else SINGLE
+def slices_of_groups(rig: Rig) -> list[slice]:
+    """Return where the parameters of each pair and single camera are."""
+    sizes = [PAIR] * len(rig.pairs) + [SINGLE] * len(rig.singles)
+    ends = np.cumsum(sizes).tolist()
+    return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+
+
+def place_of(rig: Rig, j: int) -> slice:
+    """Return where the parameters (6,) of the place in body of a pair's left camera, or of a single one, are."""
+    end = slices_of_groups(rig)[j].stop
     return slice(end - 6, end)
 
 
 def moved_cameras(rig: Rig, difference: Float) -> Rig:
-    """Return a rig whose cameras differ by a vector (P * PAIR,), or (S * SINGLE,) where it has no pairs."""
-    if rig.pairs:
-        return RigCalibration.of(rig).moved(difference).applied_to(rig)
-    singles = []
-    for single, own in zip(rig.singles, difference.reshape(-1, SINGLE), strict=True):
-        camera, place = single.left, own[PLACE:]
-        distortion, body_T_cam = camera.distortion.copy(), camera.body_T_cam.copy()
-        distortion[:DISTORTION] += own[INTRINSICS:PLACE]
-        body_T_cam[:3, :3] = so3_exp(place[:3].copy()) @ body_T_cam[:3, :3]
-        body_T_cam[:3, 3] += place[3:]
-        intrinsics = camera.intrinsics + own[:INTRINSICS]
-        moved = replace(camera, intrinsics=intrinsics, distortion=distortion, body_T_cam=body_T_cam)
-        singles.append(SingleCamera(moved))
-    return replace(rig, singles=tuple(singles))
+    """Return a rig whose cameras differ by a vector (`n_of_cameras`,)."""
+    return RigCalibration.of(rig).moved(difference).applied_to(rig)
 
 
 def is_linear(camera: Camera) -> Bool:
@@ -95,9 +85,8 @@ def relative_to_first(rig: Rig, j: int) -> Float:
 
     Where body turns or moves against all cameras, their places in it change, and none of these differences does.
     """
-    place = first_place(rig)
-    rows, own_end = np.zeros((6, n_of_cameras(rig))), (j + 1) * place.stop
-    first, own = rows[:, place], rows[:, own_end - 6 : own_end]
+    rows = np.zeros((6, n_of_cameras(rig)))
+    first, own = rows[:, place_of(rig, 0)], rows[:, place_of(rig, j)]
     first -= np.eye(6)
     own += np.eye(6)
     first[3:, :3] += skew(rig.groups[j].left.body_T_cam[:3, 3] - rig.groups[0].left.body_T_cam[:3, 3])
@@ -105,14 +94,17 @@ def relative_to_first(rig: Rig, j: int) -> Float:
 
 
 class RigCalibration(NamedTuple):
-    """Calibration of P pairs, as kernels take it; index 0 of two is the left camera, 1 the right one.
+    """Calibration of G pairs and single cameras, as kernels take it.
+
+    Index 0 of two is the left camera, 1 the right one; a single camera takes the place of both.
 
     Attributes:
-        models: (P, 2) numbers of the camera models.
-        intrinsics: (P, 2, 4) ``[fx, fy, cx, cy]``, pixels.
-        distortion: (P, 2, 8).
-        right_T_left: (P, 4, 4).
-        body_T_left: (P, 4, 4).
+        models: (G, 2) numbers of the camera models.
+        intrinsics: (G, 2, 4) ``[fx, fy, cx, cy]``, pixels.
+        distortion: (G, 2, 8).
+        right_T_left: (G, 4, 4).
+        body_T_left: (G, 4, 4).
+        is_single: (G,).
     """
 
     models: Int
@@ -120,22 +112,33 @@ class RigCalibration(NamedTuple):
     distortion: Float
     right_T_left: Float
     body_T_left: Float
+    is_single: Bool
 
     @staticmethod
     def of(rig: Rig) -> RigCalibration:
         """Collect the arrays of a rig."""
-        cameras = [(pair.left, pair.right) for pair in rig.pairs]
+        cameras = [(group.cameras[0], group.cameras[-1]) for group in rig.groups]
         return RigCalibration(
             np.array([[camera.model_number for camera in both] for both in cameras], dtype=np.int64),
             np.array([[camera.intrinsics for camera in both] for both in cameras]),
             np.array([[camera.distortion for camera in both] for both in cameras]),
-            np.array([pair.right_T_left for pair in rig.pairs]),
-            np.array([pair.left.body_T_cam for pair in rig.pairs]),
+            np.array([both[1].cam_T_body @ both[0].body_T_cam for both in cameras]),
+            np.array([left.body_T_cam for left, _ in cameras]),
+            np.array([isinstance(group, SingleCamera) for group in rig.groups]),
+        )
+
+    @property
+    def columns(self) -> Int:
+        """Where the parameters (`n_of_cameras`,) are among (G * PAIR,), where single cameras have as many as pairs."""
+        of_pair, of_single = np.arange(PAIR), np.r_[LEFT:CAMERA, BODY:PAIR]
+        return np.concatenate(
+            [j * PAIR + (of_single if is_single else of_pair) for j, is_single in enumerate(self.is_single)]
         )
 
     def moved(self, difference: Float) -> RigCalibration:
-        """Return the calibration that differs from this one by a vector (P * PAIR,)."""
-        each = difference.reshape(-1, PAIR)
+        """Return the calibration that differs from this one by a vector (`n_of_cameras`,)."""
+        each = np.zeros((len(self.models), PAIR))
+        each.ravel()[self.columns] = difference
         right_T_left, body_T_left = self.right_T_left.copy(), self.body_T_left.copy()
         for j, of_pair in enumerate(each):
             stereo, body = of_pair[STEREO:BODY], of_pair[BODY:]
@@ -151,22 +154,21 @@ class RigCalibration(NamedTuple):
             distortion,
             right_T_left,
             body_T_left,
+            self.is_single,
         )
 
     def applied_to(self, rig: Rig) -> Rig:
         """Return a rig of the same cameras with this calibration."""
-        pairs = []
-        for j, pair in enumerate(rig.pairs):
+        pairs, singles = [], []
+        for j, group in enumerate(rig.groups):
             body_T_left = self.body_T_left[j]
-            body_T_right = body_T_left @ np.linalg.inv(self.right_T_left[j])
-            pairs.append(
-                StereoPair(
-                    pair.name,
-                    self._camera(pair.left, j, 0, body_T_left),
-                    self._camera(pair.right, j, 1, body_T_right),
-                )
-            )
-        return replace(rig, pairs=tuple(pairs))
+            left = self._camera(group.left, j, 0, body_T_left)
+            if isinstance(group, StereoPair):
+                body_T_right = body_T_left @ np.linalg.inv(self.right_T_left[j])
+                pairs.append(StereoPair(group.name, left, self._camera(group.right, j, 1, body_T_right)))
+            else:
+                singles.append(SingleCamera(left))
+        return replace(rig, pairs=tuple(pairs), singles=tuple(singles))
 
     def _camera(self, camera: Camera, j: int, which: int, body_T_cam: Float) -> Camera:
         return replace(

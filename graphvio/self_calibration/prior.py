@@ -7,7 +7,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import CalibrationSigmas
 from graphvio.geometry import skew
-from graphvio.rig import Camera, CameraGroup, Rig, StereoPair
+from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.self_calibration.evidence import FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import (
     ACCEL_BIAS,
@@ -22,13 +22,12 @@ from graphvio.self_calibration.parameters import (
     CAMERA,
     DISTORTION,
     INTRINSICS,
-    PAIR,
     STEREO,
-    first_place,
     is_linear,
     n_of_cameras,
+    place_of,
     relative_to_first,
-    single_cameras,
+    slices_of_groups,
 )
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
@@ -48,9 +47,10 @@ def file_prior(rig: Rig) -> FilePrior:
     Cameras and left to right are one group, their places in body and the IMU another one.
     """
     of_cameras = _covariance_of_cameras(rig)
-    n, size = len(of_cameras), first_place(rig).stop
+    n = len(of_cameras)
     group = np.full(n, _CAMERAS)
-    group.reshape(-1, size)[:, -6:] = _PLACES
+    for j in range(len(rig.groups)):
+        group[place_of(rig, j)] = _PLACES
     if rig.imu is None:
         return FilePrior(of_cameras, group)
     covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
@@ -78,18 +78,18 @@ def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
 
 
 def extrinsic_covariances(rig: Rig, posterior: Gaussian) -> dict[int, Float]:
-    """Return the covariances of the pairs' places relative to the first pair.
+    """Return the covariances of the places of pairs and single cameras relative to the first pair.
 
     Returns:
-        Pair index, of all but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``.
+        Index, of all but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``.
     """
-    n = PAIR * len(rig.pairs)
-    of_pairs, found = posterior.covariance[:n, :n], {}
-    for j, pair in enumerate(rig.pairs[1:], start=1):
+    n = n_of_cameras(rig)
+    of_cameras, found = posterior.covariance[:n, :n], {}
+    for j, group in enumerate(rig.groups[1:], start=1):
         about_origin = np.eye(6)  # of body, and not about the camera
-        about_origin[3:, :3] = skew(pair.left.body_T_cam[:3, 3])
+        about_origin[3:, :3] = skew(group.left.body_T_cam[:3, 3])
         rows = about_origin @ relative_to_first(rig, j)
-        found[j] = rows @ of_pairs @ rows.T
+        found[j] = rows @ of_cameras @ rows.T
     return found
 
 
@@ -100,21 +100,20 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
         rig: with the calibration of the posterior.
         posterior: of the difference from a rig file.
     """
-    covariance, known, size = posterior.covariance, rig.calibration_sigmas, first_place(rig).stop
-    groups: tuple[CameraGroup, ...] = rig.pairs or rig.singles
+    covariance, known = posterior.covariance, rig.calibration_sigmas
     of_cameras = covariance[: n_of_cameras(rig), : n_of_cameras(rig)]
-    of_group = [_sigmas(covariance, slice(j * size, (j + 1) * size)) for j in range(len(groups))]
+    of_group = [_sigmas(covariance, own) for own in slices_of_groups(rig)]
     first = of_group[0][-6:]
-    rows = [relative_to_first(rig, j) for j in range(1, len(groups))]
+    rows = [relative_to_first(rig, j) for j in range(1, len(rig.groups))]
     relative = [np.sqrt(np.diag(each @ of_cameras @ each.T)) for each in rows] or [first]
     cameras = [
         (camera, of_group[j][which * CAMERA : (which + 1) * CAMERA])
-        for j, group in enumerate(groups)
+        for j, group in enumerate(rig.groups)
         for which, camera in enumerate(group.cameras)
     ]
     stereo_deg, baseline_share = known.stereo_rotation_deg, known.stereo_baseline_share
     if rig.pairs:
-        of_stereo = [(pair, sigmas[STEREO:BODY]) for pair, sigmas in zip(rig.pairs, of_group, strict=True)]
+        of_stereo = [(pair, of_group[j][STEREO:BODY]) for j, pair in enumerate(rig.pairs)]
         stereo_deg = float(np.rad2deg(max(sigmas[:3].max() for _, sigmas in of_stereo)))
         baseline_share = max(float(sigmas[3:].max()) / pair.baseline_m for pair, sigmas in of_stereo)
     focal_share = max(float((sigmas[:2] / camera.intrinsics[:2]).max()) for camera, sigmas in cameras)
@@ -160,16 +159,16 @@ def _sigmas_of_imu(known: CalibrationSigmas) -> Float:
 
 def _covariance_of_cameras(rig: Rig) -> Float:
     """Return the covariance of the cameras' parameters, see `graphvio.self_calibration.parameters`."""
-    known, size = rig.calibration_sigmas, first_place(rig).stop
-    groups: tuple[CameraGroup, ...] = rig.pairs or rig.singles
-    covariance = np.zeros((len(groups) * size, len(groups) * size))
+    known, n = rig.calibration_sigmas, n_of_cameras(rig)
+    covariance = np.zeros((n, n))
     own = [_sigmas_of_pair(pair, known) for pair in rig.pairs]
-    own += [_sigmas_of_lens(camera, known) for camera in single_cameras(rig)]
+    own += [_sigmas_of_lens(single.left, known) for single in rig.singles]
     common = np.repeat([np.deg2rad(known.body_rotation_deg), known.body_translation_m], 3) ** 2
     single = np.repeat([np.deg2rad(known.pair_rotation_deg), known.pair_translation_m], 3) ** 2
     by_common = np.zeros((len(covariance), 6))  # body turns about its origin, which moves the cameras in it
-    for j, (group, sigmas) in enumerate(zip(groups, own, strict=True)):
-        inner, place = slice(j * size, (j + 1) * size - 6), slice((j + 1) * size - 6, (j + 1) * size)
+    for j, (group, sigmas) in enumerate(zip(rig.groups, own, strict=True)):
+        place = place_of(rig, j)
+        inner = slice(slices_of_groups(rig)[j].start, place.start)
         covariance[inner, inner] = np.diag(np.maximum(sigmas, _MIN_SIGMA) ** 2)
         by_common[place] = np.eye(6)
         by_common[place][3:, :3] = -skew(group.left.body_T_cam[:3, 3])

@@ -102,7 +102,7 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         window: measurements.
         states: initial.
         nominal: calibration of the rig file.
-        difference: (C,) initial difference from it: of the pairs, and with an IMU also of its parameters.
+        difference: (C,) initial difference from it: of the cameras, and with an IMU also of its parameters.
         prior: of that difference.
     """
     first = states
@@ -114,7 +114,7 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
     for _ in range(_MAX_STEPS):
         damped = at.hessian + damping * np.diag(np.diag(at.hessian))
         step = -solve_symmetric(damped, at.gradient)
-        moved = _moved(states, window.tracks, found, step, len(difference))
+        moved = _moved(states, window.tracks, found, step, nominal, len(difference))
         changed = difference + step[calibration]
         kept = found
         found = Eliminated.empty(window.tracks)
@@ -145,17 +145,18 @@ def _linearise(
     found: Eliminated,
 ) -> _Linearised:
     """Linearise over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``, with the landmarks eliminated."""
-    n, c, n_cameras = len(states.poses), len(difference), PAIR * len(nominal.models)
+    n, c, n_cameras = len(states.poses), len(difference), len(nominal.columns)
     size = 6 * n + c + (3 * n + 3 if window.samples is not None else 0)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    cameras = slice(0, 6 * n + n_cameras)
-    visual_hessian, visual_gradient = np.zeros((cameras.stop, cameras.stop)), np.zeros(cameras.stop)
+    cameras, columns = slice(0, 6 * n + n_cameras), _visual_columns(n, nominal)
+    visual_size = 6 * n + PAIR * len(nominal.models)
+    visual_hessian, visual_gradient = np.zeros((visual_size, visual_size)), np.zeros(visual_size)
     moved = nominal.moved(difference[:n_cameras])
     cost, errors2 = eliminate_landmarks(
         states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE, damping,
         visual_hessian, visual_gradient, found,
     )  # fmt: skip
-    hessian[cameras, cameras], gradient[cameras] = visual_hessian, visual_gradient
+    hessian[cameras, cameras], gradient[cameras] = visual_hessian[np.ix_(columns, columns)], visual_gradient[columns]
     calibration = slice(6 * n, 6 * n + c)
     hessian[calibration, calibration] += prior.information
     gradient[calibration] += prior.information @ (difference - prior.mean)
@@ -173,12 +174,17 @@ def _linearise(
         inertial = inertial_equations(
             window.samples, InertialStates(states.poses, states.velocities, states.gravity, difference[n_cameras:])
         )
-        columns = _inertial_columns(n, c, n_cameras)
-        hessian[np.ix_(columns, columns)] += inertial.hessian
-        gradient[columns] += inertial.gradient
+        at = _inertial_columns(n, c, n_cameras)
+        hessian[np.ix_(at, at)] += inertial.hessian
+        gradient[at] += inertial.gradient
         cost += inertial.cost + _add_loose(states, first, hessian, gradient, 6 * n + c)
         imu_errors2 = inertial.errors2
     return _Linearised(hessian, gradient, cost, errors2, imu_errors2)
+
+
+def _visual_columns(n: int, nominal: RigCalibration) -> Int:
+    """Return where ``[poses, cameras]`` of K keyframes are among the unknowns of `eliminate_landmarks`."""
+    return np.concatenate([np.arange(6 * n), 6 * n + nominal.columns])
 
 
 def _inertial_columns(n: int, c: int, n_cameras: int) -> Int:
@@ -209,14 +215,18 @@ def _add_loose(states: States, first: States, hessian: Float, gradient: Float, a
     )
 
 
-def _moved(states: States, tracks: Tracks, eliminated: Eliminated, step: Float, n_calibration: int) -> States:
+def _moved(
+    states: States, tracks: Tracks, eliminated: Eliminated, step: Float, nominal: RigCalibration, n_calibration: int
+) -> States:
     """Return the states after a step; the landmarks follow from it."""
     n = len(states.poses)
     poses = states.poses.copy()
     for k, of_pose in enumerate(step[: 6 * n].reshape(n, 6)):
         poses[k, :3, 3] += states.poses[k, :3, :3] @ of_pose[3:]
         poses[k, :3, :3] = states.poses[k, :3, :3] @ so3_exp(of_pose[:3].copy())
-    landmarks = landmarks_after(states.landmarks, tracks, eliminated, step, n)
+    of_cameras, columns = np.zeros(6 * n + PAIR * len(nominal.models)), _visual_columns(n, nominal)
+    of_cameras[columns] = step[: len(columns)]
+    landmarks = landmarks_after(states.landmarks, tracks, eliminated, of_cameras, n)
     inertial = step[6 * n + n_calibration :]
     if not len(inertial):
         return states._replace(poses=poses, landmarks=landmarks)

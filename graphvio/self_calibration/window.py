@@ -14,16 +14,19 @@ from graphvio.self_calibration.parameters import RigCalibration
 
 _MAX_ERROR2 = 25.0  # squared whitened error of a view of what stands still
 _MAX_OFF = 0.3  # share of a landmark's views that may be farther off
+_RAY_SIGMA = 1e-3  # of normalised coordinates
+_MAX_INVERSE_DEPTH_SIGMA = 0.1  # 1/m, of a single camera's landmarks to begin with
+_MIN_AHEAD = 0.1  # cosine or so: of rays that the camera has turned away from
 
 
 class View(NamedTuple):
-    """What one pair saw at one instant: N tracks.
+    """What one pair or single camera saw at one instant: N tracks.
 
     Attributes:
         ids: (N,) identities, increasing.
         left_px: (N, 2) in the left image.
         right_px: (N, 2) in the right image; meaningful where ``has_right``.
-        has_right: (N,) whether a match was found there.
+        has_right: (N,) whether a match was found there; never by a single camera.
         inverse_depths: (N,) in the left camera's frame, 1/m; meaningful where ``has_right``.
     """
 
@@ -40,7 +43,7 @@ class Keyframe(NamedTuple):
     Attributes:
         stamp_ns: of the frameset.
         odom_T_body: (4, 4) as it was estimated then.
-        views: pair index -> what it saw.
+        views: index of the pair or single camera -> what it saw.
     """
 
     stamp_ns: int
@@ -51,13 +54,14 @@ class Keyframe(NamedTuple):
 def choose_tracks(
     keyframes: Sequence[Keyframe], poses: Float, calibration: RigCalibration, max_tracks: int
 ) -> tuple[Tracks, Float]:
-    """Choose tracks that were matched left to right, the longest of each pair, and where their landmarks are.
+    """Choose the longest tracks of each pair and single camera whose depth is known, and where their landmarks are.
 
     Args:
         keyframes: K of them, in time order.
         poses: (K, 4, 4) ``odom_T_body``.
-        calibration: of P pairs.
-        max_tracks: of each pair.
+        calibration: of pairs and single cameras. Those of a pair were matched left to right; the depth of those of a
+            single camera comes from the poses.
+        max_tracks: of each pair or camera.
 
     Returns:
         The tracks, and the landmarks (L, 3) in their frames.
@@ -73,7 +77,13 @@ def choose_tracks(
             *(np.concatenate([view[field] for _, view in seen]) for field in range(1, 5)),
         ]
         order = np.lexsort((columns[0], ids))
-        rows = _longest(ids[order], columns[3][order], max_tracks)
+        has_depth = columns[3][order]
+        if calibration.is_single[j]:
+            rays = _rays(calibration, j, columns[1][order])
+            columns[4][order], has_depth = inverse_depths_of_tracks(
+                ids[order], rays, poses[columns[0][order]] @ calibration.body_T_left[j]
+            )
+        rows = _longest(ids[order], has_depth, max_tracks)
         chosen: Int = order[rows]
         if len(chosen):
             parts.append((j, ids[chosen], *(column[chosen] for column in columns)))
@@ -86,18 +96,45 @@ def choose_tracks(
     firsts = np.flatnonzero(np.r_[True, (np.diff(ids) != 0) | (np.diff(pair_of_rows) != 0)])
     bounds = np.r_[firsts, len(ids)]
     pair = pair_of_rows[firsts]
-    matched = np.flatnonzero(has_right)
+    matched = np.flatnonzero(has_right | calibration.is_single[pair_of_rows])
     first = matched[np.searchsorted(matched, firsts)]
     landmarks = np.empty((len(firsts), 3))
     for j in np.unique(pair):
         of_pair = pair == j
-        landmarks[of_pair, :2], _ = unproject_pixels(
-            int(calibration.models[j, 0]), calibration.intrinsics[j, 0], calibration.distortion[j, 0],
-            np.ascontiguousarray(left_px[first[of_pair]]),
-        )  # fmt: skip
+        landmarks[of_pair, :2] = _rays(calibration, j, left_px[first[of_pair]])
     landmarks[:, 2] = np.maximum(inverse_depths[first], 0.0)
     odom_T_landmark = poses[keyframe[first]] @ calibration.body_T_left[pair]
     return Tracks(pair, odom_T_landmark, bounds, keyframe, left_px, right_px, has_right), landmarks
+
+
+def inverse_depths_of_tracks(ids: Int, rays: Float, odom_T_cam: Float) -> tuple[Float, Bool]:
+    """Triangulate a camera's tracks from where it was, by linear least squares.
+
+    Args:
+        ids: (N,) identities of the observations, sorted, those of a track in time order.
+        rays: (N, 2) normalised coordinates.
+        odom_T_cam: (N, 4, 4) of the camera at each.
+
+    Returns:
+        Inverse depths (N,) in the camera that saw the track first, 1/m, the same for all its observations, and whether
+        each is known (N,).
+    """
+    firsts = np.r_[0, np.flatnonzero(np.diff(ids)) + 1]
+    lengths = np.diff(firsts, append=len(ids))
+    first = np.repeat(firsts, lengths)
+    rotation = np.swapaxes(odom_T_cam[:, :3, :3], 1, 2)
+    homogeneous = np.column_stack([rays, np.ones(len(rays))])
+    ahead = np.einsum("nij,njk,nk->ni", rotation, odom_T_cam[first, :3, :3], homogeneous[first])
+    shift = np.einsum("nij,nj->ni", rotation, odom_T_cam[first, :3, 3] - odom_T_cam[:, :3, 3])
+    # A point seen at (x, y) is (ahead + w shift) there; what is across the ray vanishes.
+    depth = np.maximum(ahead[:, 2], _MIN_AHEAD)[:, None]
+    by_depth = (shift[:, :2] - rays * shift[:, 2:]) / depth
+    off = (ahead[:, :2] - rays * ahead[:, 2:]) / depth
+    information = np.add.reduceat((by_depth**2).sum(axis=1), firsts)
+    along = np.add.reduceat((by_depth * off).sum(axis=1), firsts)
+    is_known = information > (_RAY_SIGMA / _MAX_INVERSE_DEPTH_SIGMA) ** 2
+    inverse_depths = np.where(is_known, -along / np.where(is_known, information, 1.0), 0.0)
+    return np.repeat(inverse_depths, lengths), np.repeat(is_known & (inverse_depths >= 0.0), lengths)
 
 
 def stationary(tracks: Tracks, errors2: Float) -> Bool:
@@ -117,13 +154,22 @@ def median_displacement_px(then: View, now: View) -> float:
     return float(np.median(np.linalg.norm(now.left_px[at_now] - then.left_px[at_then], axis=1)))
 
 
-def _longest(ids: Int, has_right: Bool, max_tracks: int) -> Int:
-    """Select the rows of the tracks seen most often, and matched at least once, of rows (N,) sorted by identity."""
+def _rays(calibration: RigCalibration, j: int, left_px: Float) -> Float:
+    """Return normalised coordinates (N, 2) of pixels in the left image of a pair, or in a single camera's."""
+    rays, _ = unproject_pixels(
+        int(calibration.models[j, 0]), calibration.intrinsics[j, 0], calibration.distortion[j, 0],
+        np.ascontiguousarray(left_px),
+    )  # fmt: skip
+    return np.asarray(rays)
+
+
+def _longest(ids: Int, has_depth: Bool, max_tracks: int) -> Int:
+    """Select the rows of the tracks seen most often, with depth at least once, of rows (N,) sorted by identity."""
     if not len(ids):
         return np.empty(0, dtype=np.int64)
     firsts = np.concatenate([[0], np.flatnonzero(np.diff(ids)) + 1])
     lengths = np.diff(firsts, append=len(ids))
-    matched = np.flatnonzero(np.logical_or.reduceat(has_right, firsts))
+    matched = np.flatnonzero(np.logical_or.reduceat(has_depth, firsts))
     longest = np.sort(matched[np.argsort(-lengths[matched], kind="stable")[:max_tracks]])
     is_of_one = np.zeros(len(firsts), dtype=bool)
     is_of_one[longest] = True
