@@ -119,8 +119,14 @@ def run_all(args: argparse.Namespace) -> None:
         args.docs = False
     _tables(report, results)
     if args.docs:
-        has_pairs = bool(set(args.pairs) & set(_PAIRS))
-        report.save_to_docs("calibration-error" if has_pairs else "calibration-error-singles")
+        report.save_to_docs(_docs_table(set(args.pairs)))
+
+
+def _docs_table(pairs: set[str]) -> str:
+    """Return the name of the table in the docs for the cameras that took part."""
+    if "front+single" in pairs:
+        return "calibration-error-beside"
+    return "calibration-error" if pairs & set(_PAIRS) else "calibration-error-singles"
 
 
 def _rendered(args: argparse.Namespace, scene: str) -> Path:
