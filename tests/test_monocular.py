@@ -795,15 +795,6 @@ def test_run_without_pairs_and_imu_is_refused(walk: Path, tmp_path: Path) -> Non
     assert "the scale cannot be known" in ran.stderr
 
 
-def test_calibrate_of_single_cameras_is_refused(walk: Path, tmp_path: Path) -> None:
-    rig = load_rig(walk / "rig.yaml").without_pairs()
-    save_rig(rig, tmp_path / "rig.yaml")
-    for command, options in (("calibrate", ()), ("optimize", ("--refine-calibration",))):
-        ran = graphvio(command, walk, "--rig", tmp_path / "rig.yaml", *options, "--out", tmp_path / f"{command}.yaml")
-        assert ran.returncode == 2
-        assert f"graphvio {' '.join((command, *options))} needs a stereo pair" in ran.stderr
-
-
 @pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").exists(), reason="the recording is not here")
 def test_run_one_camera_of_euroc_from_a_moving_start(tmp_path: Path) -> None:
     ran = graphvio("run", REAL_DATA / "euroc_mh01_clip", "--cameras", "0", "--to", "8", "--out", tmp_path / "out")

@@ -22,7 +22,8 @@ from graphvio.odometry.recorded_calibration import calibrate_recording
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration.batch import Batch, calibrate_windows, difference_of
-from graphvio.self_calibration.online import FullWindow, SelfCalibration
+from graphvio.self_calibration.collector import FullWindow
+from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO
 from graphvio.simulation.calibration_error import CalibrationError as CalibrationErrors
 from graphvio.simulation.calibration_error import calibration_differences, draw
@@ -109,6 +110,29 @@ def test_calibrate_recording_finds_all_parameters(walk: Path) -> None:
     assert found.rig.calibration_sigmas.stereo_rotation_deg < 0.5 * FACTORY.stereo_rotation_deg
     assert [each.group for each in found.agreements if not each.is_good] == []
     assert {each.part for each in found.findings if each.is_significant} >= {"pair back, rotation against front"}
+
+
+def test_calibrate_recording_of_single_cameras_finds_lenses_and_places(walk: Path) -> None:
+    true = load_rig(walk).without_pairs()
+    written = draw(
+        true, CalibrationErrors.of_level(2, ["principal-point", "cameras-in-body", "time-offset"]), 1
+    ).written_rig
+    found = calibrate_recording(open_source(walk, written), written)
+    before, after = rms(written, true), rms(found.rig, true)
+    for name, share in (("principal_point_px", 0.8), ("cameras_in_body_deg", 0.5)):
+        assert after[name] < share * before[name], name
+    assert {curve.group for curve in found.curves} >= {
+        "focal lengths",
+        f"cameras against {true.singles[0].name}, rotation",
+    }
+    assert not any(found.batch.left_out)
+
+
+def test_command_left_to_right_of_single_cameras_is_refused(walk: Path) -> None:
+    for what in ("pairs", "stereo"):
+        done = command(walk, "--no-pairs", "--what", what)
+        assert done.exit_code != 0
+        assert "needs a stereo pair" in str(done.exception)
 
 
 def test_calibrate_recording_of_one_group_keeps_the_others(walk: Path) -> None:

@@ -24,11 +24,12 @@ from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
 from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
 from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, _scratch, eliminate_landmarks
+from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector
-from graphvio.self_calibration.online import FullWindow, SelfCalibration
+from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import (
     BODY,
     CAMERA,
@@ -390,7 +391,7 @@ def test_self_calibration_at_a_standstill_keeps_few_samples() -> None:
     for k in range(200 * 120):
         calibration.add_sample(ImuSample(5_000_000 * k, zero, zero))
     calibration.close()
-    assert len(calibration._samples) <= 200 * 30 + 1
+    assert len(calibration._collector._samples) <= 200 * 30 + 1
 
 
 def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_lenses() -> None:

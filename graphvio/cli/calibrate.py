@@ -49,6 +49,8 @@ def calibrate(
     scale: options.Scale = "auto",
     config: options.ConfigName = "default",
     pairs: options.Pairs = None,
+    cameras: options.Cameras = None,
+    no_pairs: options.NoPairs = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     seed: options.Seed = 0,
@@ -64,7 +66,7 @@ def calibrate(
 
     --what all finds everything, from a rig file that is about right: cameras (focal lengths, principal points,
     distortion), stereo (left to right), imu (cameras to IMU, time offset, scale), and pairs. With cameras, stereo or
-    imu all else is kept as in the rig file, which must be right about it.
+    imu all else is kept as in the rig file, which must be right about it. With an IMU, single cameras will do.
 
     Ends with exit code 0; with 2 where nothing can be determined; with 3 where the motions determine a part only.
 
@@ -89,8 +91,19 @@ def calibrate(
     _check_outputs(out, report, [] if rig is None else [rig])
     is_of_pairs = _is_of_pairs(what, {"--correct-imu": correct_imu, "--guide": guide, "--scale": scale != "auto"})
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=pairs, from_s=from_s, to_s=to_s, topics=topics)
-    opened.rig.need_pairs("graphvio calibrate")
+    opened = open_recording(
+        source,
+        rig,
+        settings,
+        pairs=pairs,
+        cameras=cameras,
+        no_pairs=no_pairs,
+        from_s=from_s,
+        to_s=to_s,
+        topics=topics,
+    )
+    if what in ("pairs", "stereo"):
+        opened.rig.need_pairs(f"graphvio calibrate --what {what}")
     if not is_of_pairs:
         calibrate_rig(opened, settings, what, out, report)
         return

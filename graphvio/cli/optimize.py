@@ -101,8 +101,6 @@ def optimize(
         )
         for source in sources
     ]
-    for source in opened if refine_calibration else []:
-        source.rig.need_pairs("graphvio optimize --refine-calibration")
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")

@@ -37,9 +37,9 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
 from graphvio.odometry.vision_events import VisionEvents
 from graphvio.rig import Rig
+from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding
-from graphvio.self_calibration.online import FullWindow
 from graphvio.timing import timed
 
 

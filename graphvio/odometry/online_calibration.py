@@ -18,10 +18,11 @@ from graphvio.measurements.sensors import ImuSample
 from graphvio.odometry.innovation_allowance import InnovationAllowance
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
+from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction
 from graphvio.self_calibration.imu_correction import ImuCorrection
-from graphvio.self_calibration.online import FullWindow, SelfCalibration
+from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.window import View
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
@@ -110,11 +111,8 @@ class OnlineCalibration:
         if estimator.epoch != self._epoch:
             self._epoch = estimator.epoch
             self._calibration.start_window()
-        views = {
-            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
-            for j, frame in self._frontend.frames_at(stamp_ns).items()
-        }
-        self._calibration.add_frameset(stamp_ns, estimator.state().nav_T_body, views, quality is Quality.WEAK)
+        pose, views = estimator.state().nav_T_body, self._views_at(stamp_ns)
+        self._calibration.add_frameset(stamp_ns, pose, views, quality is Quality.WEAK)
 
     def update(self, stamp_ns: int) -> Float | None:
         """Let the other stages use the calibration that comes into force after a frameset.
@@ -161,6 +159,13 @@ class OnlineCalibration:
         """Take note that the newest pose has been changed by a tangent (6,) in body."""
         if self._calibration is not None:
             self._calibration.correct_pose(turned)
+
+    def _views_at(self, stamp_ns: int) -> dict[int, View]:
+        """Return what pairs and single cameras see at the newest frameset."""
+        return {
+            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
+            for j, frame in self._frontend.frames_at(stamp_ns).items()
+        }
 
     def _report_findings(self, stamp_ns: int) -> None:
         """Report once that the rig file is wrong beyond 5 sigma, and each pair that is not where the file has it."""

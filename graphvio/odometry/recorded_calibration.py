@@ -19,10 +19,10 @@ from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.self_calibration.batch import Batch, calibrate_windows, difference_of
+from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.curves import Curve, curves_of
 from graphvio.self_calibration.evidence import FilePrior
 from graphvio.self_calibration.findings import SCALE_MOTION, Finding, findings
-from graphvio.self_calibration.online import FullWindow
 from graphvio.self_calibration.parameters import RigCalibration
 from graphvio.self_calibration.prior import file_prior
 
@@ -176,10 +176,13 @@ def calibrate_recording(
 
     Raises:
         CalibrationError: if the rig cannot be calibrated so, or hardly moved.
+        RigError: if left to right is to be calibrated, and there is no pair.
     """
     config = replace(config or Config(), calibration=CalibrationConfig(online=True))
     if not config.estimates_calibration:
         raise CalibrationError(f"motion.reference is {config.motion.reference}: calibration wants tracks of keyframes")
+    if what == "stereo":
+        rig.need_pairs("the calibration of left to right")
     if what == "imu" and rig.imu is None:
         raise CalibrationError(f"{rig.name} has no IMU to calibrate")
     windows, odometry, end_ns = _windows(measurements, rig, config, on_progress)

@@ -111,7 +111,6 @@ class Stages:
 
     Raises:
         OptimizationError: if the folder cannot be used.
-        RigError: if a rig of single cameras only is to be calibrated.
     """
 
     def __init__(
@@ -124,8 +123,6 @@ class Stages:
         calibrates: bool = False,
         on_progress: Progress | None = None,
     ) -> None:
-        for session in sessions if calibrates else ():
-            session.source.rig.need_pairs("the calibration of a session")
         self._sessions = sessions
         self._calibrates = calibrates
         self._config = config

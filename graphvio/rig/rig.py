@@ -142,8 +142,8 @@ class Rig:
         if not self.pairs:
             names = ", ".join(single.name for single in self.singles)
             raise RigError(
-                f"{self.name}: has only single cameras ({names}), and {user} needs a stereo pair; graphvio run, slam "
-                "and optimize take such rigs"
+                f"{self.name}: has only single cameras ({names}), and {user} needs a stereo pair; graphvio run, slam, "
+                "optimize and calibrate --what all take such rigs"
             )
 
     def without_imu(self) -> Rig:

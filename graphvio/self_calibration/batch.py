@@ -15,9 +15,9 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
+from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import Evidence, FilePrior, Gaussian
-from graphvio.self_calibration.online import FullWindow
 from graphvio.self_calibration.parameters import RigCalibration
 from graphvio.self_calibration.prior import file_prior, walk_per_second
 

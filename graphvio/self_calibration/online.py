@@ -7,7 +7,6 @@ comes into force a fixed number of framesets after its adjustment began, so that
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
+from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
@@ -29,11 +29,8 @@ from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.parameters import RigCalibration, n_of_cameras
 from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
-from graphvio.self_calibration.window import Keyframe, View, median_displacement_px
+from graphvio.self_calibration.window import Keyframe, View
 
-_WINDOW = 16  # keyframes
-_MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe: a standstill has no keyframes
-_FIRST_SIGMA_PX = 0.15
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
@@ -46,10 +43,6 @@ _MAX_REFUSED = 3  # full windows
 _MIN_CONFIRMING = 2  # full windows; one is at times off by more than its covariance says
 WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
-_IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
-_MAX_IMU_GAP_NS = 50_000_000
-_MARGIN_NS = 50_000_000  # of IMU samples before a window
-_KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
 
 
 class _Pace(NamedTuple):
@@ -61,26 +54,12 @@ class _Pace(NamedTuple):
 
 
 _PACES = (
-    _Pace((1, 3, 6, 10, _WINDOW), 0.1, 2),
-    _Pace((5, 10, _WINDOW), 0.1, 4),
-    _Pace((5, 10, _WINDOW), 0.15, 4),
-    _Pace((8, _WINDOW), 0.25, 8),
+    _Pace((1, 3, 6, 10, WINDOW), 0.1, 2),
+    _Pace((5, 10, WINDOW), 0.1, 4),
+    _Pace((5, 10, WINDOW), 0.15, 4),
+    _Pace((8, WINDOW), 0.25, 8),
 )
 """Of the first windows; the last one is that of all later ones."""
-
-
-class FullWindow(NamedTuple):
-    """Measurements of a window that is full.
-
-    Attributes:
-        keyframes: in time order.
-        samples: of the IMU, or None.
-        sigma_px: noise of a corner's position, as it is known from the windows before.
-    """
-
-    keyframes: tuple[Keyframe, ...]
-    samples: InertialSamples | None
-    sigma_px: float
 
 
 class _Adjusted(NamedTuple):
@@ -134,10 +113,8 @@ class SelfCalibration:
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
-        self._sigma_px = _FIRST_SIGMA_PX
-        self._samples: deque[ImuSample] = deque()
-        self._keyframes: list[Keyframe] = []
-        self._last: Keyframe | None = None
+        self._sigma_px = FIRST_SIGMA_PX
+        self._collector = WindowCollector(rig)
         self._full_windows = 0
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
@@ -155,9 +132,7 @@ class SelfCalibration:
 
     def add_sample(self, sample: ImuSample) -> None:
         """Take an IMU sample as it was measured, in time order."""
-        self._samples.append(sample)
-        while sample.stamp_ns - self._samples[0].stamp_ns > _KEPT_NS:
-            self._samples.popleft()
+        self._collector.add_sample(sample)
 
     def add_frameset(
         self, stamp_ns: int, odom_T_body: Float, views: Mapping[int, View], are_contradicting: bool = False
@@ -172,7 +147,7 @@ class SelfCalibration:
                 did, and the scene if they once agreed.
         """
         self._adjust_when_due()
-        if not self._is_keyframe(stamp_ns, views):
+        if not self._collector.is_keyframe(stamp_ns, views, self._pace.interval_s):
             return
         if self.is_trusted:
             if knocked := self._knocks.update(views, self._in_force):
@@ -180,8 +155,7 @@ class SelfCalibration:
             elif are_contradicting:
                 return
         self._agreeing += not are_contradicting
-        self._last = Keyframe(stamp_ns, odom_T_body, views)
-        self._keyframes.append(self._last)
+        self._collector.add(stamp_ns, odom_T_body, views)
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
         """Return the covariance (6, 6) that errors of the calibration add to the newest pose (4, 4)."""
@@ -193,7 +167,8 @@ class SelfCalibration:
 
     def start_window(self) -> None:
         """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
-        self._keyframes, self._adjusted_at, self._last = [], 0, None
+        self._collector.restart()
+        self._adjusted_at = 0
 
     def update(self) -> bool:
         """Take the result that comes into force after this frameset, if there is one.
@@ -268,22 +243,10 @@ class SelfCalibration:
             self._pending = None
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
-        self._keyframes, self._adjusted_at, self._full_windows = [], 0, 0
+        self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self.has_full_window, self._agreeing, self._refused = False, 0, 0
         self.restarts += 1
         self._consider.forget()
-
-    def _is_keyframe(self, stamp_ns: int, views: Mapping[int, View]) -> bool:
-        """Whether the images have moved, and time has passed, since the last keyframe."""
-        last = self._last
-        if last is None or not views:
-            return bool(views)
-        if (stamp_ns - last.stamp_ns) * 1e-9 < self._pace.interval_s - 1e-3:
-            return False
-        common = views.keys() & last.views.keys()
-        return not common or any(
-            median_displacement_px(last.views[j], views[j]) >= _MIN_DISPLACEMENT_PX for j in common
-        )
 
     def _adjust_when_due(self) -> None:
         """Begin to adjust the window as it is now, if it has grown enough; a full one is followed by a new one.
@@ -293,17 +256,17 @@ class SelfCalibration:
         """
         if self._pending is not None:
             return
-        if len(self._keyframes) < min(size for size in self._pace.adjusted_at if size > self._adjusted_at):
+        if len(self._collector.keyframes) < min(size for size in self._pace.adjusted_at if size > self._adjusted_at):
             return
-        window = tuple(self._keyframes)
+        window = tuple(self._collector.keyframes)
         self._due_in = self._pace.delay_framesets
         self._adjusted_at = len(window)
-        if is_full := len(window) >= _WINDOW:
-            self._keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
+        if is_full := len(window) >= WINDOW:
+            self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
         prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
-        samples, difference = self._samples_of(window), self.estimate.posterior.mean
+        samples, difference = self._collector.samples_of(window), self.estimate.posterior.mean
         if is_full:
             self.on_full_window(FullWindow(window, samples, self._sigma_px))
         self._pending = self._worker.submit(self._adjust, window, samples, difference, prior, is_full)
@@ -346,24 +309,6 @@ class SelfCalibration:
             is_full,
         )
 
-    def _samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
-        """Return the IMU over a window, or None where there is none; older samples are forgotten."""
-        imu = self._rig.imu
-        if imu is None:
-            return None
-        first_ns = window[0].stamp_ns + imu.time_offset_ns - _MARGIN_NS
-        while self._samples and self._samples[0].stamp_ns < first_ns:
-            self._samples.popleft()
-        if not self._samples:
-            return None
-        return InertialSamples(
-            np.array([sample.stamp_ns - imu.time_offset_ns for sample in self._samples]),
-            np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in self._samples]),
-            np.array([keyframe.stamp_ns for keyframe in window]),
-            _IMU_NOISE_FACTOR * np.array([imu.gyro_noise_density, imu.accel_noise_density]),
-            _MAX_IMU_GAP_NS,
-        )
-
 
 def adjust_nothing(rig: Rig) -> None:
     """Adjust two keyframes that see one point, to compile or load the kernels."""
@@ -374,7 +319,8 @@ def adjust_nothing(rig: Rig) -> None:
     for stamp_ns in (-10_000_000, *stamps_ns, 110_000_000) if rig.imu is not None else ():
         calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
     prior = calibration.estimate.posterior
-    adjusted(keyframes, calibration._samples_of(keyframes), calibration._nominal, prior.mean, prior, _FIRST_SIGMA_PX)
+    samples = calibration._collector.samples_of(keyframes)
+    adjusted(keyframes, samples, calibration._nominal, prior.mean, prior, FIRST_SIGMA_PX)
     calibration.close()
     information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
     solve_lower(cholesky(information), right)

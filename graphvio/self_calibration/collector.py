@@ -1,0 +1,98 @@
+"""Windows of keyframes for the self-calibration, and the IMU samples over them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.measurements.sensors import ImuSample
+from graphvio.rig import Rig
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.window import Keyframe, View, median_displacement_px
+
+WINDOW = 16  # keyframes
+FIRST_SIGMA_PX = 0.15
+_MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe: a standstill has no keyframes
+_IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
+_MAX_IMU_GAP_NS = 50_000_000
+_MARGIN_NS = 50_000_000  # of IMU samples before a window
+_KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
+
+
+class FullWindow(NamedTuple):
+    """Measurements of a window that is full.
+
+    Attributes:
+        keyframes: in time order.
+        samples: of the IMU, or None.
+        sigma_px: noise of a corner's position, as it is known from the windows before.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    samples: InertialSamples | None
+    sigma_px: float
+
+
+class WindowCollector:
+    """Collects keyframes while the images move; windows share no keyframe.
+
+    Args:
+        rig: of the rig file, with the IMU's noise and time offset.
+
+    Attributes:
+        keyframes: of the window that grows.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.keyframes: list[Keyframe] = []
+        self._imu = rig.imu
+        self._samples: deque[ImuSample] = deque()
+        self._last: Keyframe | None = None
+
+    def add_sample(self, sample: ImuSample) -> None:
+        """Take an IMU sample as it was measured, in time order."""
+        self._samples.append(sample)
+        while sample.stamp_ns - self._samples[0].stamp_ns > _KEPT_NS:
+            self._samples.popleft()
+
+    def is_keyframe(self, stamp_ns: int, views: Mapping[int, View], interval_s: float) -> bool:
+        """Whether the images have moved, and the interval has passed, since the last keyframe."""
+        last = self._last
+        if last is None or not views:
+            return bool(views)
+        if (stamp_ns - last.stamp_ns) * 1e-9 < interval_s - 1e-3:
+            return False
+        common = views.keys() & last.views.keys()
+        return not common or any(
+            median_displacement_px(last.views[j], views[j]) >= _MIN_DISPLACEMENT_PX for j in common
+        )
+
+    def add(self, stamp_ns: int, odom_T_body: Float, views: Mapping[int, View]) -> None:
+        """Add a keyframe: its stamp, its estimated pose (4, 4), and what was seen."""
+        self._last = Keyframe(stamp_ns, odom_T_body, views)
+        self.keyframes.append(self._last)
+
+    def restart(self) -> None:
+        """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
+        self.keyframes, self._last = [], None
+
+    def samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
+        """Return the IMU over a window, or None where there is none; older samples are forgotten."""
+        if self._imu is None:
+            return None
+        first_ns = window[0].stamp_ns + self._imu.time_offset_ns - _MARGIN_NS
+        while self._samples and self._samples[0].stamp_ns < first_ns:
+            self._samples.popleft()
+        if not self._samples:
+            return None
+        return InertialSamples(
+            np.array([sample.stamp_ns - self._imu.time_offset_ns for sample in self._samples]),
+            np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in self._samples]),
+            np.array([keyframe.stamp_ns for keyframe in window]),
+            _IMU_NOISE_FACTOR * np.array([self._imu.gyro_noise_density, self._imu.accel_noise_density]),
+            _MAX_IMU_GAP_NS,
+        )
