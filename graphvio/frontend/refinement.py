@@ -85,20 +85,33 @@ def refine(
         images_rig, images, rows = image_by_image(rig, observations)
         counted = np.ones(len(rows)) if known is None else known[rows].astype(np.float64)
         return Refined(*_refined_per_image(start, rig, observations, inlier, images_rig, images, counted, *settings))
-    refined = Refined(*_refined(start, rig, observations, inlier, *settings))
+    shows_noise = observations.has_right | observations.has_known_depth(config.pixel_sigma_px)
+    refined = Refined(*_refined(start, rig, observations, inlier, shows_noise, *settings))
     in_front = np.isfinite(refined.errors_px)
     if in_front[refined.inlier].all():
         return refined
     # The last step took points behind a camera, whose depth is hardly known: once more without them.
-    return Refined(*_refined(start, rig, observations, refined.inlier & in_front, *settings))
+    return Refined(*_refined(start, rig, observations, refined.inlier & in_front, shows_noise, *settings))
 
 
 @kernel
 def _refined(
-    cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, sigma: float, scale_px: float,
-    max_error_px: float, inflation: float,
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, shows_noise: Bool, sigma: float,
+    scale_px: float, max_error_px: float, inflation: float,
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
-    """Compute the fields of `Refined`, in their order; ``known`` has no elements where inliers are not known."""
+    """Compute the fields of `Refined`, in their order.
+
+    Args:
+        cur_T_ref: (4, 4) initial motion.
+        rig: of P pairs.
+        observations: N points.
+        known: (N,) the inliers; no elements where they are not known.
+        shows_noise: (N,) the others' depth is adapted to nearly any error.
+        sigma: pixel noise as it is modelled.
+        scale_px: of the Cauchy cost.
+        max_error_px: of inliers.
+        inflation: of covariances.
+    """
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right, blocks = observations.has_right, in_blocks(observations)
     at, pose, hessian = unexpanded(blocks), cur_T_ref, np.empty((6, 6))
@@ -106,15 +119,19 @@ def _refined(
     errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
     is_known = len(known) == len(has_right)
     inlier = known if is_known else np.ones(len(has_right), dtype=np.bool_)
-    judged, scale = inlier, widest
+    scale = widest
     # One loop for the search and for the last, precise round: a kernel is compiled again wherever it is called.
     for number in range(_ROUNDS_TO_FIND_INLIERS if is_known else 0, _ROUNDS_TO_FIND_INLIERS + 1):
         is_last = number == _ROUNDS_TO_FIND_INLIERS
         if is_last and not is_known:
             # One pair's images may be blurred or dim: its points are then less certain than the others'.
-            noise = noise_by_pair(errors2, has_right, observations.pair, len(sigmas_px), largest2)
+            judged = _only(np.ones(len(inlier), dtype=np.bool_), shows_noise)
+            noise = noise_by_pair(
+                errors2[judged], has_right[judged], observations.pair[judged], len(sigmas_px), largest2
+            )
             errors2 /= noise[observations.pair]
             sigmas_px *= np.sqrt(noise)
+        judged = _only(inlier if is_known else np.ones(len(inlier), dtype=np.bool_), shows_noise)
         variance = noise_variance(errors2[judged], has_right[judged], largest2)
         if is_known or not is_last:
             scale = _scale(variance, widest)
@@ -128,9 +145,19 @@ def _refined(
             pose, rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), sigmas_px, scale,
             _MAX_ROUNDS if is_last else 1, _CONVERGED if is_last else _NEAR,
         )  # fmt: skip
-    covariance, shared = _covariances(pose, hessian, errors2, rig, blocks, at, inlier, has_right, sigmas_px, scale)
+    judged = _only(inlier, shows_noise)
+    covariance, shared = _covariances(
+        pose, hessian, errors2, rig, blocks, at, inlier, judged, has_right, sigmas_px, scale
+    )
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
     return pose, inflation * covariance, inflation * shared, inlier, errors_px
+
+
+@kernel
+def _only(points: Bool, wanted: Bool) -> Bool:
+    """Select the points (N,) that are wanted, or all of them where none is."""
+    both: Bool = points & wanted
+    return both if both.any() else points
 
 
 @kernel
@@ -163,7 +190,9 @@ def _refined_per_image(
         left_motions(pose, rig), rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
         hessian, np.empty(6), np.empty((len(blocks.pair), POINTS)),
     )  # fmt: skip
-    covariance, shared = _covariances(pose, hessian, errors2, rig, blocks, at, inlier, has_right, sigmas_px, scale)
+    covariance, shared = _covariances(
+        pose, hessian, errors2, rig, blocks, at, inlier, inlier, has_right, sigmas_px, scale
+    )
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
     return pose, inflation * covariance, inflation * shared, inlier, errors_px
 
@@ -171,10 +200,13 @@ def _refined_per_image(
 @kernel
 def _covariances(
     pose: Float, hessian: Float, errors2: Float, rig: RigArrays, blocks: Blocks, at: Expansion, inlier: Bool,
-    has_right: Bool, sigmas_px: Float, scale: float,
+    judged: Bool, has_right: Bool, sigmas_px: Float, scale: float,
 ) -> tuple[Float, Float]:  # fmt: skip
-    """Covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`."""
-    used = influence(errors2[inlier], has_right[inlier], scale)
+    """Covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`.
+
+    The noise is that of some of the inliers, which are judged.
+    """
+    used = influence(errors2[judged], has_right[judged], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
     lower = cholesky(information)

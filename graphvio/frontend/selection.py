@@ -6,10 +6,12 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import robust_cost
+from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, explained, refine
+
+_MIN_SIGMAS = 3.0  # of a translation by whose flow depths are seen
 
 
 def joint_motion(
@@ -27,6 +29,36 @@ def joint_motion(
     known = _is_depth_known(rig, observations, config.pixel_sigma_px)
     searched = observations if known.all() or not known.any() else observations.of_rows(known)
     return refine(rig, observations, search(rig, searched, predicted, config, rng), config)
+
+
+def joint_motion_with_vague_depths(
+    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
+) -> tuple[Refined, Observations]:
+    """Estimate a motion as `joint_motion`, where single cameras' points may hardly have a depth yet.
+
+    The flow of such a point is any that the translation can explain. Where the translation is about zero, its error
+    decides, and the minimum would lie where the noise of these points is explained best. So the motion is estimated
+    by the other points first, and what is not known of its translation counts as noise of their rays.
+
+    Returns:
+        The motion on all points, and the observations with that noise.
+    """
+    known = _is_depth_known(rig, observations, config.pixel_sigma_px)
+    if known.all() or known.sum() < config.min_inliers:
+        return joint_motion(rig, observations, predicted, config, rng), observations
+    first = joint_motion(rig, observations.of_rows(known), predicted, config, rng)
+    covariances, noise_px = observations.covariances.copy(), first.rms_px() or config.pixel_sigma_px
+    # A depth that is not known is not better known where the noise turns out to be less than modelled.
+    scale = np.array([1.0, 1.0, max(config.pixel_sigma_px / noise_px, 1.0)])
+    vague, pair = covariances[~known] * np.outer(scale, scale), observations.pair[~known]
+    translation = left_motions(first.cur_T_ref, rig)[:, 0, :3, 3]
+    of_translation = np.linalg.eigvalsh(first.covariance[3:, 3:])[-1]
+    sure = np.maximum((translation**2).sum(axis=1) - _MIN_SIGMAS**2 * of_translation, 0.0)
+    unseen = 1.0 / (1.0 / vague[:, 2, 2] + (rig.focal_px[:, 0] ** 2 * sure)[pair])  # of inverse depths, by the flow
+    vague[:, :2, :2] += unseen[:, None, None] * of_translation * np.eye(2)
+    covariances[~known] = vague
+    observations = observations._replace(covariances=covariances)
+    return refine(rig, observations, first.cur_T_ref, config), observations
 
 
 def _is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) -> Bool:

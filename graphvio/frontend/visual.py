@@ -23,7 +23,7 @@ from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.rolling_shutter import ReadoutMotion
-from graphvio.frontend.selection import best_pair_motion, joint_motion
+from graphvio.frontend.selection import best_pair_motion, joint_motion_with_vague_depths
 from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracker import PairTracker
@@ -242,7 +242,8 @@ class VisualFrontend:
         predicted = predict(seen.reference_stamp_ns)
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
-            refined = joint_motion(self._places.arrays, observations, start, config, rng)
+            arrays = self._places.arrays
+            refined, observations = joint_motion_with_vague_depths(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
             agreement = agree(self._places.arrays, observations, refined, config, rng, self._places.uncertain, in_doubt)
             if agreement.contradicts:
