@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from calibration_walks import walk_simulator
+from rendered import rendered_once
 from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float
@@ -16,13 +17,14 @@ from graphvio.config import Config
 from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import SourceError
 from graphvio.geometry import se3_inverse
+from graphvio.image_decoding import read_grey
 from graphvio.mapping.mapper import Mapper
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
-from graphvio.simulation import Simulator
+from graphvio.simulation import Simulator, write_recording
 from graphvio.slam.keyframe import CorrectionResult
 
-ROUND_S = 8.0
+ROUND_S, WHOLE_S = 8.0, 12.0
 SIGMAS = (np.deg2rad(0.2), 0.03)  # much for the few metres that are walked
 LATER_NS = 10**15  # between two sessions
 CONFIG = replace(
@@ -41,12 +43,20 @@ def around(t: Float) -> Float:
 
 @cache
 def simulator() -> Simulator:
-    return walk_simulator(12.0, around)
+    return walk_simulator(WHOLE_S, around)
 
 
 @cache
 def rendered(index: int) -> FrameSet:
-    return simulator().frameset(index)
+    """A frameset of the recording of the whole walk."""
+    folder = rendered_once("walk", lambda path: write_recording(simulator(), path), around.__name__, WHOLE_S)
+    stamp_ns, images = int(simulator().stamps_ns[index]), {}
+    for j, pair in enumerate(simulator().rig.pairs):
+        left, right = (
+            read_grey(folder / f"mav0/{camera.name}/data/{stamp_ns}.png") for camera in (pair.left, pair.right)
+        )
+        images[j] = left, right
+    return FrameSet(stamp_ns, images)
 
 
 class Refusing(SyntheticFrontEnd):
