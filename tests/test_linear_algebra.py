@@ -45,7 +45,7 @@ def results_at(place: int, truth: Float, seen: Observations, rig: RigArrays) -> 
 
 
 def test_motion_is_the_same_wherever_its_inputs_lie_and_whatever_blas_does(tmp_path: Path) -> None:
-    """OpenBLAS's code differs by processor, and for some by where an array lies: it must not take part."""
+    """OpenBLAS's code differs by processor and threads, and for some by where an array lies: it must not take part."""
     inputs = (*sample_frame(Conditions(per_pair=(60, 57)), np.random.default_rng(1)), arrays_of_walks())
     (tmp_path / "inputs").write_bytes(pickle.dumps(inputs))
     program = (
@@ -56,7 +56,8 @@ def test_motion_is_the_same_wherever_its_inputs_lie_and_whatever_blas_does(tmp_p
     for processor in ("Haswell", "Prescott"):
         done = subprocess.run(
             [sys.executable, "-c", program, tmp_path / "inputs"], cwd=Path(__file__).parent, capture_output=True,
-            text=True, check=True, env={**os.environ, "OPENBLAS_CORETYPE": processor},
+            text=True, check=True,
+            env={**os.environ, "OPENBLAS_CORETYPE": processor, "OPENBLAS_NUM_THREADS": "2"},
         )  # fmt: skip
         found |= set(done.stdout.split())
     assert len(found) == 1
