@@ -229,14 +229,14 @@ def test_fleet_again_does_only_what_is_missing(done: Done, folder: Path, cluster
         assert rows(out / name / "database.db") == rows(done.out / name / "database.db")
 
 
-def test_fleet_other_input_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_fleet_other_input_is_refused(folder: Path, cluster: Any, tmp_path: Path) -> None:
     (tmp_path / "sessions").mkdir()
     shutil.copytree(folder / "sound", tmp_path / "sessions" / CORRUPT)
-    arguments = (tmp_path / "sessions", "--out", tmp_path / "out", "--workers", 1)
-    result = command(folder, *arguments)
+    arguments = (tmp_path / "sessions", "--out", tmp_path / "out")
+    result = command(folder, *arguments, "--workers", 1)
     assert result.exit_code == 0, result.output
     assert "1 of 1 sessions optimised" in result.output
-    other = command(folder, *arguments, "--no-loops")
+    other = command(folder, *arguments, "--no-loops", "--scheduler", cluster.scheduler_address)
     assert other.exit_code == 3
     assert "holds results of other input (different: loops)" in other.output
 

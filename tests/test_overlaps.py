@@ -16,6 +16,8 @@ from graphvio.frontend.singles import SinglesFrontend
 from graphvio.rig import Camera, Rig, axes_angle_deg, overlap
 from graphvio.simulation import Simulator, build_scene, default_rig
 from graphvio.simulation.named_rigs import headset, phone, surround
+from graphvio.simulation.renderer import View
+from graphvio.simulation.surfaces import Surfaces
 
 
 def four_cameras() -> Rig:
@@ -28,6 +30,19 @@ def surrounding() -> Rig:
 
 def fisheyes() -> Rig:
     return headset().without_pairs().with_cameras(half_size)
+
+
+class OnceRendered(Simulator):
+    """A simulator that renders a view once for its image and its depth, as long as the same frameset is wanted."""
+
+    _index = -1
+
+    def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> View:
+        if index != self._index:
+            self._index, self._views = index, dict[int, View]()
+        if camera not in self._views:
+            self._views[camera] = super().view(index, camera, surfaces)
+        return self._views[camera]
 
 
 def true_pixels(own: Camera, rays: Float, depths: Float, other: Camera) -> Float:
@@ -56,7 +71,7 @@ class SurroundWalk(NamedTuple):
 def surround_walk() -> SurroundWalk:
     rig = surrounding()
     cameras = [single.left for single in rig.singles]
-    simulator = Simulator(build_scene("room", 5.0, 0.0), rig, 1)
+    simulator = OnceRendered(build_scene("room", 5.0, 0.0), rig, 1)
     frontend, poses, stamps = SinglesFrontend(rig, Config()), simulator.world_T_body, list(simulator.stamps_ns)
     in_world: dict[tuple[int, int], Float] = {}
     over: set[tuple[int, int]] = set()  # whose distance is noted at their first sight
@@ -98,7 +113,7 @@ def test_tracks_are_found_where_other_cameras_see_their_points(
     """At the first frameset they are searched for; at the second, of a rig that stands, they are found again."""
     rig = make_rig()
     cameras = [single.left for single in rig.singles]
-    simulator = Simulator(build_scene("room", 2.0), rig, 1)
+    simulator = OnceRendered(build_scene("room", 2.0), rig, 1)
     frontend, counts = SinglesFrontend(rig, Config()), []
     depths = [simulator.view(0, j).depth for j in range(len(cameras))]
     for k in range(2):
@@ -126,13 +141,13 @@ def test_tracks_are_found_where_other_cameras_see_their_points(
 
 def test_rolling_shutters_and_cameras_that_look_apart_share_nothing() -> None:
     rig = phone().with_cameras(half_size)
-    simulator = Simulator(build_scene("room", 1.0), rig, 1)
+    simulator = OnceRendered(build_scene("room", 1.0), rig, 1)
     frontend = SinglesFrontend(rig, Config())
     assert frontend.process(simulator.frameset(0), lambda _: None).sightings[0].elsewhere == ()
     frontend.close()
     apart = default_rig().with_only(["cam0", "cam2"]).with_cameras(half_size)
     frontend = SinglesFrontend(apart, Config())
-    frameset = Simulator(build_scene("room", 1.0), apart, 1).frameset(0)
+    frameset = OnceRendered(build_scene("room", 1.0), apart, 1).frameset(0)
     assert all(each.elsewhere == () for each in frontend.process(frameset, lambda _: None).sightings.values())
     frontend.close()
 

@@ -188,6 +188,7 @@ def test_live(session: Path, tmp_path: Path) -> None:
     run_commands("docs/how-to/live.md", tmp_path, for_a_second)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_two_realsense(session: Path, tmp_path: Path) -> None:
     """The commands after the cameras have recorded."""
     shutil.copy(session / "walk.mcap", tmp_path)
