@@ -67,6 +67,7 @@ def test_inverse_depths_of_tracks_are_those_of_points_seen_from_known_places() -
     found, is_known = inverse_depths_of_tracks(ids, seen[:, :2] / seen[:, 2:], odom_T_cam)
     np.testing.assert_array_equal(is_known, ~still[ids])
     np.testing.assert_allclose(found[is_known], (1.0 / points[:, 2])[ids[is_known]], rtol=1e-9)
+    assert [len(column) for column in inverse_depths_of_tracks(ids[:0], np.zeros((0, 2)), odom_T_cam[:0])] == [0, 0]
 
 
 def test_parameters_of_pairs_and_single_cameras_are_in_one_vector() -> None:

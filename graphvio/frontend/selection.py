@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
@@ -47,18 +47,30 @@ def joint_motion_with_vague_depths(
     if known.all() or known.sum() < config.min_inliers:
         return joint_motion(rig, observations, predicted, config, rng), observations
     first = joint_motion(rig, observations.of_rows(known), predicted, config, rng)
-    covariances, noise_px = observations.covariances.copy(), first.rms_px() or config.pixel_sigma_px
-    # A depth that is not known is not better known where the noise turns out to be less than modelled.
-    scale = np.array([1.0, 1.0, max(config.pixel_sigma_px / noise_px, 1.0)])
-    vague, pair = covariances[~known] * np.outer(scale, scale), observations.pair[~known]
-    translation = left_motions(first.cur_T_ref, rig)[:, 0, :3, 3]
-    of_translation = np.linalg.eigvalsh(first.covariance[3:, 3:])[-1]
-    sure = np.maximum((translation**2).sum(axis=1) - _MIN_SIGMAS**2 * of_translation, 0.0)
-    unseen = 1.0 / (1.0 / vague[:, 2, 2] + (rig.focal_px[:, 0] ** 2 * sure)[pair])  # of inverse depths, by the flow
-    vague[:, :2, :2] += unseen[:, None, None] * of_translation * np.eye(2)
-    covariances[~known] = vague
+    covariances, pair = observations.covariances.copy(), observations.pair[~known]
+    covariances[~known] = _with_noise_of_motion(covariances[~known], pair, rig, first, config.pixel_sigma_px)
     observations = observations._replace(covariances=covariances)
     return refine(rig, observations, first.cur_T_ref, config), observations
+
+
+def _with_noise_of_motion(covariances: Float, pair: Int, rig: RigArrays, first: Refined, sigma_px: float) -> Float:
+    """Return covariances (V, 3, 3) of points of vague depth with what is not known of a motion's translation.
+
+    Args:
+        covariances: (V, 3, 3) for a pixel noise of 1 px.
+        pair: (V,) their cameras.
+        rig: of P pairs and cameras.
+        first: the motion by other points.
+        sigma_px: pixel noise as it is modelled. Where there is less, the depths are as vague all the same.
+    """
+    scale = np.array([1.0, 1.0, max(sigma_px / (first.rms_px() or sigma_px), 1.0)])
+    vague = covariances * np.outer(scale, scale)
+    translation = left_motions(first.cur_T_ref, rig)[:, 0, :3, 3]
+    variance = np.linalg.eigvalsh(first.covariance[3:, 3:])[-1]
+    stands_out = np.maximum((translation**2).sum(axis=1) - _MIN_SIGMAS**2 * variance, 0.0)
+    flow = (rig.focal_px[:, 0] ** 2 * stands_out)[pair]  # what it shows of inverse depths
+    vague[:, :2, :2] += (variance / (1.0 / vague[:, 2, 2] + flow))[:, None, None] * np.eye(2)
+    return np.asarray(vague)
 
 
 def _is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) -> Bool:

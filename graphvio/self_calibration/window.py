@@ -16,7 +16,7 @@ _MAX_ERROR2 = 25.0  # squared whitened error of a view of what stands still
 _MAX_OFF = 0.3  # share of a landmark's views that may be farther off
 _RAY_SIGMA = 1e-3  # of normalised coordinates
 _MAX_INVERSE_DEPTH_SIGMA = 0.1  # 1/m, of a single camera's landmarks to begin with
-_MIN_AHEAD = 0.1  # cosine or so: of rays that the camera has turned away from
+_MIN_DEPTH_RATIO = 0.1  # of depths in two cameras, where one has turned away from a point
 
 
 class View(NamedTuple):
@@ -119,6 +119,8 @@ def inverse_depths_of_tracks(ids: Int, rays: Float, odom_T_cam: Float) -> tuple[
         Inverse depths (N,) in the camera that saw the track first, 1/m, the same for all its observations, and whether
         each is known (N,).
     """
+    if not len(ids):
+        return np.zeros(0), np.zeros(0, dtype=bool)
     firsts = np.r_[0, np.flatnonzero(np.diff(ids)) + 1]
     lengths = np.diff(firsts, append=len(ids))
     first = np.repeat(firsts, lengths)
@@ -127,7 +129,7 @@ def inverse_depths_of_tracks(ids: Int, rays: Float, odom_T_cam: Float) -> tuple[
     ahead = np.einsum("nij,njk,nk->ni", rotation, odom_T_cam[first, :3, :3], homogeneous[first])
     shift = np.einsum("nij,nj->ni", rotation, odom_T_cam[first, :3, 3] - odom_T_cam[:, :3, 3])
     # A point seen at (x, y) is (ahead + w shift) there; what is across the ray vanishes.
-    depth = np.maximum(ahead[:, 2], _MIN_AHEAD)[:, None]
+    depth = np.maximum(ahead[:, 2], _MIN_DEPTH_RATIO)[:, None]
     by_depth = (shift[:, :2] - rays * shift[:, 2:]) / depth
     off = (ahead[:, :2] - rays * ahead[:, 2:]) / depth
     information = np.add.reduceat((by_depth**2).sum(axis=1), firsts)
