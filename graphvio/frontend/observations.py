@@ -103,6 +103,14 @@ class Observations(NamedTuple):
         )  # fmt: skip
 
 
+def is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) -> Bool:
+    """Select the points (N,) on which a motion can be judged: not those of single cameras whose depth is unknown."""
+    is_single = rig.is_single
+    if not is_single.any():
+        return np.ones(len(observations.pair), dtype=bool)
+    return np.asarray(~is_single[observations.pair] | observations.has_known_depth(sigma_px))
+
+
 def image_by_image(rig: RigArrays, observations: Observations) -> tuple[RigArrays, Observations, Int]:
     """Take each image for a pair of its own without a right camera, and points for exact.
 

@@ -20,7 +20,7 @@ from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, po
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.noise import influence, influence_slope, inlier_cutoff, noise_by_pair, noise_variance
-from graphvio.frontend.observations import Observations, RigArrays, image_by_image
+from graphvio.frontend.observations import Observations, RigArrays, image_by_image, is_depth_known
 from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
 from graphvio.linear_algebra import cholesky, eigen, product, solve_lower, solve_symmetric
@@ -85,7 +85,7 @@ def refine(
         images_rig, images, rows = image_by_image(rig, observations)
         counted = np.ones(len(rows)) if known is None else known[rows].astype(np.float64)
         return Refined(*_refined_per_image(start, rig, observations, inlier, images_rig, images, counted, *settings))
-    shows_noise = observations.has_right | observations.has_known_depth(config.pixel_sigma_px)
+    shows_noise = is_depth_known(rig, observations, config.pixel_sigma_px)
     refined = Refined(*_refined(start, rig, observations, inlier, shows_noise, *settings))
     in_front = np.isfinite(refined.errors_px)
     if in_front[refined.inlier].all():

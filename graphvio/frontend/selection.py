@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Float, Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
-from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.observations import Observations, RigArrays, is_depth_known
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, explained, refine
 
@@ -26,7 +26,7 @@ def joint_motion(
         config: of this stage.
         rng: source of the random triples.
     """
-    known = _is_depth_known(rig, observations, config.pixel_sigma_px)
+    known = is_depth_known(rig, observations, config.pixel_sigma_px)
     searched = observations if known.all() or not known.any() else observations.of_rows(known)
     return refine(rig, observations, search(rig, searched, predicted, config, rng), config)
 
@@ -43,7 +43,7 @@ def joint_motion_with_vague_depths(
     Returns:
         The motion on all points, and the observations with that noise.
     """
-    known = _is_depth_known(rig, observations, config.pixel_sigma_px)
+    known = is_depth_known(rig, observations, config.pixel_sigma_px)
     if known.all() or known.sum() < config.min_inliers:
         return joint_motion(rig, observations, predicted, config, rng), observations
     first = joint_motion(rig, observations.of_rows(known), predicted, config, rng)
@@ -71,14 +71,6 @@ def _with_noise_of_motion(covariances: Float, pair: Int, rig: RigArrays, first: 
     flow = (rig.focal_px[:, 0] ** 2 * stands_out)[pair]  # what it shows of inverse depths
     vague[:, :2, :2] += (variance / (1.0 / vague[:, 2, 2] + flow))[:, None, None] * np.eye(2)
     return np.asarray(vague)
-
-
-def _is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) -> Bool:
-    """Select the points (N,) that a hypothesis can be scored on: not those of single cameras whose depth is unknown."""
-    is_single = rig.is_single
-    if not is_single.any():
-        return np.ones(len(observations.pair), dtype=bool)
-    return np.asarray(~is_single[observations.pair] | observations.has_known_depth(sigma_px))
 
 
 def best_pair_motion(
