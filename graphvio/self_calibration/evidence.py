@@ -110,7 +110,13 @@ class Evidence(NamedTuple):
             self.vector + posterior.information @ posterior.mean - prior.information @ prior.mean,
         )
 
-    def file_factors(self, prior: FilePrior, min_gains: Float) -> tuple[Float, float]:
+    def likelihood_of(self, prior: FilePrior) -> FactorLikelihood:
+        """Return the likelihood of the factors of a rig file."""
+        return FactorLikelihood(self, prior)
+
+    def file_factors(
+        self, prior: FilePrior, min_gains: Float, likelihood: FactorLikelihood | None = None
+    ) -> tuple[Float, float]:
         """Return by which factors the rig file's errors exceed its standard deviations, by maximum likelihood.
 
         The calibration itself is integrated out (type II maximum likelihood; D. J. C. MacKay, *Bayesian interpolation*,
@@ -119,20 +125,21 @@ class Evidence(NamedTuple):
         Args:
             prior: of the calibration.
             min_gains: (G,) twice the logarithm of the likelihood ratio from which a group of the file is not exact.
+            likelihood: `likelihood_of` this prior, if there is one already.
 
         Returns:
             The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
             over that of an exact file.
         """
-        factors, information = np.full(prior.n_groups, EXACT), np.asarray(np.linalg.inv(prior.covariance), np.float64)
-        exact = best = self._likelihood(prior, information, factors)
+        factors, likelihood = np.full(prior.n_groups, EXACT), likelihood or self.likelihood_of(prior)
+        exact = best = likelihood(factors)
         for _ in range(_SWEEPS):
             before = factors.copy()
             for group in range(prior.n_groups):
                 likelihoods = []
                 for factor in _FACTORS:
                     factors[group] = factor
-                    likelihoods.append(self._likelihood(prior, information, factors))
+                    likelihoods.append(likelihood(factors))
                 found = int(np.argmax(likelihoods))
                 if likelihoods[found] - likelihoods[0] < min_gains[group]:
                     found = 0
@@ -141,30 +148,46 @@ class Evidence(NamedTuple):
                 break
         return factors, best - exact
 
-    def mean_square(self, prior: FilePrior, in_force: Float) -> Float:
+    def mean_square(self, prior: FilePrior, in_force: Float, likelihood: FactorLikelihood | None = None) -> Float:
         """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
 
-        Here the file is as wrong as is most likely, be it for good reasons in force as it is.
+        Here the file is as wrong as is most likely, be it for good reasons in force as it is. For arguments see
+        `file_factors`.
         """
-        factors, _ = self.file_factors(prior, np.zeros(prior.n_groups))
+        factors, _ = self.file_factors(prior, np.zeros(prior.n_groups), likelihood)
         posterior = self.given(prior, factors)
         off = posterior.mean - in_force
         return np.asarray(posterior.covariance + np.outer(off, off))
 
-    def _likelihood(self, prior: FilePrior, information: Float, factors: Float) -> float:
-        """Return twice the logarithm of the marginal likelihood of factors, up to a constant.
 
-        Args:
-            prior: of the calibration.
-            information: (C, C) inverse of its covariance for factors of 1.
-            factors: (G,).
-        """
+class FactorLikelihood:
+    """Marginal likelihood of factors on a rig file's standard deviations; each is computed once.
+
+    Args:
+        evidence: of the measurements.
+        prior: of the rig file.
+    """
+
+    def __init__(self, evidence: Evidence, prior: FilePrior) -> None:
+        self._evidence, self._prior = evidence, prior
+        self._information: Float = np.asarray(np.linalg.inv(prior.covariance), np.float64)
+        self._known: dict[bytes, float] = {}
+
+    def __call__(self, factors: Float) -> float:
+        """Return twice the logarithm of the marginal likelihood of factors (G,), up to a constant."""
+        key = factors.tobytes()
+        if key not in self._known:
+            self._known[key] = self._computed(factors)
+        return self._known[key]
+
+    def _computed(self, factors: Float) -> float:
+        prior, evidence = self._prior, self._evidence
         each = prior.of_each(factors)
-        prior_information: Float = information / (each * each[:, None])
+        prior_information: Float = self._information / (each * each[:, None])
         if prior.change is not None:
             covariance = prior.with_factors(factors)
             prior_information, each = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
-        lower = cholesky(self.information + prior_information)
-        fitted = solve_lower(lower, self.vector.reshape(1, -1))[0]
+        lower = cholesky(evidence.information + prior_information)
+        fitted = solve_lower(lower, evidence.vector.reshape(1, -1))[0]
         likelihood = float(fitted @ fitted - 2.0 * np.log(each * np.diag(lower)).sum())
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite

@@ -283,13 +283,14 @@ class SelfCalibration:
         await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
         evidence = self._evidence.with_window(prior, solution.calibration)
-        factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
+        likelihood = evidence.likelihood_of(self._prior)
+        factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
         posterior = evidence.given(self._prior, _assumed(factors))
         n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
         is_changed = self._prior.change is not None
         if is_changed or (factors != EXACT).any():
             in_force = evidence.given(self._prior, factors).mean
-        covariance = evidence.mean_square(self._prior, in_force)[:n_cameras, :n_cameras]
+        covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n_cameras, :n_cameras]
         extrinsics = {}
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
