@@ -22,7 +22,7 @@ from typer.testing import CliRunner, Result
 
 from graphvio.cli import app
 from graphvio.config import Config
-from graphvio.errors import FleetError, RigError
+from graphvio.errors import FleetError
 from graphvio.fleet import tasks
 from graphvio.fleet.listing import Listed, list_sessions
 from graphvio.fleet.run import FleetProgress, optimize_fleet
@@ -239,13 +239,6 @@ def test_fleet_other_input_is_refused(folder: Path, cluster: Any, tmp_path: Path
     other = command(folder, *arguments, "--no-loops", "--scheduler", cluster.scheduler_address)
     assert other.exit_code == 3
     assert "holds results of other input (different: loops)" in other.output
-
-
-def test_fleet_calibration_without_a_pair_is_refused(folder: Path, config: Config, tmp_path: Path) -> None:
-    reading = tasks.Reading(cameras=("cam0",))
-    job = tasks.Job("sound", str(folder / "sound"), str(tmp_path), config, None, True, 2, reading, calibrates=True)
-    with pytest.raises(RigError, match="the calibration of a session needs a stereo pair"):
-        tasks.odometry(job)
 
 
 @pytest.mark.usefixtures("without_plots")
