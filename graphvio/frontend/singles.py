@@ -158,7 +158,9 @@ class SinglesFrontend(VisualFrontend):
             parallaxes.append(np.hypot(moved[:, 0], moved[:, 1]))
         if overlap < self._config.motion.keyframe_overlap * of_reference:
             return True
-        parallax = float(np.median(np.concatenate(parallaxes))) if parallaxes else 0.0
+        if not overlap:  # the reference is of the dark, and has no track that could be lost
+            return any(len(frame.ids) for frame in frames.values())
+        parallax = float(np.median(np.concatenate(parallaxes)))
         if cur_T_reference is None:
             return parallax > _MIN_PARALLAX and since_ns >= _MIN_INTERVAL_NS
         return parallax > _MAX_PARALLAX
