@@ -19,8 +19,8 @@ def textured(k: int) -> Image:
     """A texture that moves by some pixels from image to image."""
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (HEIGHT, 2 * WIDTH)).astype(np.float32), (0, 0), 2.0)
-    stretched = np.clip(128.0 + 6.0 * (noise - noise.mean()), 0.0, 255.0).astype(np.uint8)
-    return np.ascontiguousarray(stretched[:, SHIFT_PX * k : SHIFT_PX * k + WIDTH])
+    image = np.clip(128.0 + 6.0 * (noise - noise.mean()), 0.0, 255.0).astype(np.uint8)
+    return np.ascontiguousarray(image[:, SHIFT_PX * k : SHIFT_PX * k + WIDTH])
 
 
 def test_tracks_after_the_dark_are_those_of_a_new_keyframe() -> None:
