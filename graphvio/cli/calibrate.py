@@ -79,13 +79,11 @@ def calibrate(
         graphvio calibrate walk --what all --out rig-calibrated.yaml --report calibration
     """
     from graphvio.calibration.calibrate import calibrate_pairs
-    from graphvio.calibration.report.document import document, write_document
     from graphvio.cli.calibrate_rig import calibrate_rig
     from graphvio.cli.calibration_progress import CalibrationProgress
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
-    from graphvio.rig_files import save_rig
     from graphvio.runtime import set_up_threads
 
     _check_outputs(out, report, [] if rig is None else [rig])
@@ -102,11 +100,10 @@ def calibrate(
         to_s=to_s,
         topics=topics,
     )
-    if what in ("pairs", "stereo"):
-        opened.rig.need_pairs(f"graphvio calibrate --what {what}")
     if not is_of_pairs:
         calibrate_rig(opened, settings, what, out, report)
         return
+    opened.rig.need_pairs("graphvio calibrate --what pairs")
     if correct_imu and (out is None or opened.rig.imu is None):
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
@@ -115,6 +112,22 @@ def calibrate(
     names = [pair.name for pair in opened.rig.pairs]
     with CalibrationProgress(opened.frameset_count, names if guide else None) as progress:
         found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=progress.on_frameset)
+    _deliver(found, out, report, opened.name, progress.framesets, correct_imu=correct_imu)
+
+
+def _deliver(
+    found: Calibration,
+    out: Path | None,
+    report: Path | None,
+    name: str,
+    framesets: int,
+    *,
+    correct_imu: bool,
+) -> None:
+    """Print where the pairs are, write what is asked for, and say by the exit code whether all of it is known."""
+    from graphvio.calibration.report.document import document, write_document
+    from graphvio.rig_files import save_rig
+
     publish(document(found))
     _print_result(found)
     if out is not None:
@@ -126,7 +139,7 @@ def calibrate(
         else:
             warn(f"{out} is not written, only {numbers}: the motions determine a part only")
     if report is not None:
-        _write_report(found, report, opened.name, progress.framesets)
+        _write_report(found, report, name, framesets)
     if not found.is_complete:
         raise typer.Exit(EXIT_INCOMPLETE)
 

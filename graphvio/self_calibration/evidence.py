@@ -110,10 +110,6 @@ class Evidence(NamedTuple):
             self.vector + posterior.information @ posterior.mean - prior.information @ prior.mean,
         )
 
-    def likelihood_of(self, prior: FilePrior) -> FactorLikelihood:
-        """Return the likelihood of the factors of a rig file."""
-        return FactorLikelihood(self, prior)
-
     def file_factors(
         self, prior: FilePrior, min_gains: Float, likelihood: FactorLikelihood | None = None
     ) -> tuple[Float, float]:
@@ -125,13 +121,13 @@ class Evidence(NamedTuple):
         Args:
             prior: of the calibration.
             min_gains: (G,) twice the logarithm of the likelihood ratio from which a group of the file is not exact.
-            likelihood: `likelihood_of` this prior, if there is one already.
+            likelihood: of the same evidence and prior, if there is one already.
 
         Returns:
             The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
             over that of an exact file.
         """
-        factors, likelihood = np.full(prior.n_groups, EXACT), likelihood or self.likelihood_of(prior)
+        factors, likelihood = np.full(prior.n_groups, EXACT), likelihood or FactorLikelihood(self, prior)
         exact = best = likelihood(factors)
         for _ in range(_SWEEPS):
             before = factors.copy()

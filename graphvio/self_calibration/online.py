@@ -22,7 +22,7 @@ from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
+from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FactorLikelihood, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
@@ -283,7 +283,7 @@ class SelfCalibration:
         await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
         evidence = self._evidence.with_window(prior, solution.calibration)
-        likelihood = evidence.likelihood_of(self._prior)
+        likelihood = FactorLikelihood(evidence, self._prior)
         factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
         posterior = evidence.given(self._prior, _assumed(factors))
         n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
