@@ -199,11 +199,12 @@ def fly(
     mismatched: float = 0.0,
     believed: Rig | None = None,
     config: Config | None = None,
+    offset_ms: int = 0,
 ) -> Flown:
     """Run the estimator alone, on perfect associations; with every third frameset a keyframe.
 
-    IMU samples of the time between ``late`` come at its end. ``mismatched`` is that of `Tracks`; ``believed`` is the
-    rig that the estimator is given.
+    IMU samples of the time between ``late`` come at its end, and all of them are stamped ``offset_ms`` late.
+    ``mismatched`` is that of `Tracks`; ``believed`` is the rig that the estimator is given.
     """
     shares, rig = rig is not None, rig or single_rig()
     assert rig.imu is not None
@@ -223,7 +224,8 @@ def fly(
     for k in range(round(duration_s * 20)):
         stamp_ns = k * FRAME_NS
         while next_ns <= stamp_ns + 2 * IMU_NS and not late[0] <= stamp_ns * 1e-9 < late[1]:
-            estimator.add_sample(next_ns, flight.reading(next_ns * 1e-9) + noise * rng.normal(size=6))
+            taken_s = (next_ns - offset_ms * 1_000_000) * 1e-9
+            estimator.add_sample(next_ns, flight.reading(taken_s) + noise * rng.normal(size=6))
             next_ns += IMU_NS
         t = stamp_ns * 1e-9
         is_still = before is not None and bool(np.abs(flight.pose(t) - before).max() < 1e-9)
@@ -547,9 +549,26 @@ def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_
     np.testing.assert_array_equal(exact.rig.cameras[1].body_T_cam, rig.cameras[1].body_T_cam)
 
 
-def wrong_by(rig: Rig, seed: int) -> tuple[Float, Rig]:
-    """Return the difference of a rig from a file that is wrong by its standard deviations, and the file."""
-    sampled = draw(rig, CalibrationError.of_level(2, ["focal", "principal-point", "pair-transform"]), seed)
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("offset_ms", [-8, 8])
+def test_first_window_by_a_wrong_file_finds_a_time_offset_of_either_sign(offset_ms: int, seed: int) -> None:
+    """Samples that are stamped late end before the newest frameset does: the first window needs what is to come."""
+    rig = overlapping_rig()
+    _, written = wrong_by(rig, seed, level=3)
+    flown = fly(moving(), 4.0, rig=rig, believed=written, offset_ms=offset_ms)
+    assert [kind for kind, _ in flown.events] == [EventKind.SCALE_KNOWN]
+    assert flown.stamps_s[0] < 2.0
+    error_m, scale = aligned(flown)
+    assert error_m < 0.01
+    assert abs(scale - 1.0) < 0.01
+    estimate = flown.estimator.calibration
+    assert estimate is not None
+    assert abs(estimate.time_offset_s - 1e-3 * offset_ms) < 3.0 * estimate.sigmas[-1]
+
+
+def wrong_by(rig: Rig, seed: int, level: int = 2) -> tuple[Float, Rig]:
+    """Return the difference of a rig from a file that is wrong by a level's standard deviations, and the file."""
+    sampled = draw(rig, CalibrationError.of_level(level, ["focal", "principal-point", "pair-transform"]), seed)
     written = sampled.written_rig
     difference = []
     for camera, true in zip(written.cameras, rig.cameras, strict=True):

@@ -69,7 +69,11 @@ class WindowCalibration:
     @property
     def is_file_exact(self) -> bool:
         """Whether the measurements say nothing against the rig file."""
-        return bool((self.factors == EXACT).all())
+        return self.is_exact(self.factors)
+
+    def is_exact(self, factors: Float) -> bool:
+        """Return whether some factors (G,) are those of an exact file."""
+        return bool((factors == EXACT).all())
 
     @property
     def candidates(self) -> list[Float]:
@@ -80,7 +84,7 @@ class WindowCalibration:
 
     def file(self, factors: Float) -> Float | None:
         """Return the information (F, F) of a rig file that is wrong by some factors (G,), None where it is exact."""
-        if (factors == EXACT).all():
+        if self.is_exact(factors):
             return None
         key = tuple(factors.tolist())
         if key not in self._files:
@@ -103,6 +107,11 @@ class WindowCalibration:
         if not self.is_file_exact:
             walk[n:, n:] = self._walk
         return np.asarray(np.sqrt(seconds) * walk)
+
+    def likeliest_factors(self, evidence: Evidence) -> Float:
+        """Return by which factors (G,) the rig file is most likely wrong, given that it is not exact."""
+        found, _ = evidence.file_factors(self._prior, np.zeros(self._prior.n_groups))
+        return np.maximum(found, _MIN_FACTOR)
 
     def begin(self, factors: Float) -> None:
         """Begin with a window that is adjusted with some factors (G,)."""

@@ -98,7 +98,7 @@ class MonocularEstimator:
         self._has_imu = self._is_initialised = False
         self._sigma_px = _FIRST_SIGMA_PX
         self._initialiser = self._new_initialiser()
-        self._trust = OverlapTrust(self._new_initialiser())
+        self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
         self._has_overlaps, self._are_trusted = False, True
         self._window: Window | None = None
         self._latest_ns = 0
@@ -325,7 +325,9 @@ class MonocularEstimator:
 
         Once the calibration is estimated, the window itself finds out how the cameras are turned to each other.
         """
-        is_estimated = self._calibration is not None and not self._calibration.is_file_exact
+        is_estimated = self._calibration is not None and not (
+            self._calibration.is_file_exact and (window is None or self._calibration.is_exact(window.factors))
+        )
         if not (self._has_overlaps and self._are_trusted) or is_estimated:
             return None
         states = None if window is None else window.states
@@ -451,7 +453,7 @@ class MonocularEstimator:
         )
 
     def _measured(self, window: Window, structure: Structure) -> Measurements:
-        samples = self._samples.between(window.states.stamps_ns)
+        samples = self._samples.between(window.states.stamps_ns, self._file is None)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
 
     def _set_covariance(self, adjusted: Adjusted) -> None:
@@ -501,12 +503,12 @@ class MonocularEstimator:
         self._window, self._before, self._contradicted_since_ns = None, None, None
         self._solved = None
         self._initialiser = self._new_initialiser()
-        self._trust = OverlapTrust(self._new_initialiser())
+        self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
         self.covariance = _NO_COVARIANCE
         self._since_ns, self._is_reported = stamp_ns, False
 
-    def _new_initialiser(self) -> Initialiser:
-        return Initialiser(self._cameras, self._calibration, self._samples.between, _FIRST_SIGMA_PX)
+    def _new_initialiser(self, doubts_file: bool = True) -> Initialiser:
+        return Initialiser(self._cameras, self._calibration, self._samples.between, _FIRST_SIGMA_PX, doubts_file)
 
     def _oldest_needed_ns(self, stamp_ns: int) -> int:
         """Return the stamp from which on IMU samples are needed at a frameset."""

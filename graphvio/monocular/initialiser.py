@@ -18,7 +18,7 @@ from graphvio.errors import MeasurementError
 from graphvio.geometry import se3, se3_inverse
 from graphvio.measurements.motion import Sighting
 from graphvio.measurements.sensors import GRAVITY_M_S2
-from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, scale_sigma
+from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, evidence_of, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.reprojection import Cameras
@@ -80,19 +80,22 @@ class Initialiser:
         calibration: says how wrong the rig file may be; None where it is taken for exact.
         samples_of: Returns the IMU's samples of some instants.
         sigma_px: noise of a corner's position.
+        doubts_file: whether windows that fit no motion are tried with a rig file that is wrong.
     """
 
     def __init__(
         self,
         cameras: Cameras,
         calibration: WindowCalibration | None,
-        samples_of: Callable[[np.ndarray], InertialSamples],
+        samples_of: Callable[[np.ndarray, bool], InertialSamples],
         sigma_px: float,
+        doubts_file: bool = True,
     ) -> None:
         self._cameras = cameras
         self._calibration = calibration
         self._samples_of = samples_of
         self._sigma_px = sigma_px
+        self._doubts_file = doubts_file
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
         self._fits_no_motion = False  # the window that was tested last
@@ -140,7 +143,7 @@ class Initialiser:
             return [_NO_FACTORS]
         candidates = self._calibration.candidates
         self._contradicted += self._fits_no_motion
-        if not self._fits_no_motion or self._contradicted < self._doubted_at:
+        if not (self._doubts_file and self._fits_no_motion) or self._contradicted < self._doubted_at:
             return candidates[:1]
         self._doubted_at *= 2  # each attempt takes as long as many framesets
         return candidates
@@ -150,7 +153,7 @@ class Initialiser:
         self._fits_no_motion = False
         file = None if self._calibration is None else self._calibration.file(factors)
         stamps = np.array([stamp for stamp, _, _ in self._keyframes])
-        samples = self._samples_of(stamps)
+        samples = self._samples_of(stamps, file is None)
         names, landmarks = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1), Landmarks()
         views = []
         for _, sightings, _ in self._keyframes:
@@ -189,6 +192,9 @@ class Initialiser:
             states = adjusted.states
             landmarks.put(adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
+            if file is not None and self._calibration is not None and fitting == 1.0:
+                factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
+                file = self._calibration.file(factors)
             fitting *= 1.0 - float(off.mean())
             names.end(ids[off])
             views = [each.without(ids[off]) for each in views]

@@ -71,20 +71,26 @@ class SampleBuffer:
         """
         return preintegrate(*self._extended(), start_ns, end_ns, parameters, self._noise, self._max_gap_ns)
 
-    def between(self, stamps_ns: Int) -> InertialSamples:
-        """Return the samples in use, for the intervals between the stamps (K,) of states."""
-        return InertialSamples(*self._extended(), stamps_ns, self._noise, self._max_gap_ns)
+    def between(self, stamps_ns: Int, is_offset_known: bool) -> InertialSamples:
+        """Return the samples in use, for the intervals between the stamps (K,) of states.
+
+        Args:
+            stamps_ns: (K,).
+            is_offset_known: whether the time offset is taken for known, and stays as it is.
+        """
+        return InertialSamples(*self._extended(is_offset_known), stamps_ns, self._noise, self._max_gap_ns)
 
     @property
     def _offset_ns(self) -> int:
         return round(self.time_offset_s * 1e9)
 
-    def _extended(self) -> tuple[Int, Float]:
+    def _extended(self, is_offset_known: bool = True) -> tuple[Int, Float]:
         """Return the samples in use; where their time offset is estimated, the newest reading lasts a little longer.
 
         An offset that has just been found may ask for samples that have not come; the next framesets have them.
         """
-        if self.time_offset_s == 0.0 or not len(self._stamps_ns):
+        is_exact = is_offset_known and self.time_offset_s == 0.0
+        if is_exact or not len(self._stamps_ns):
             return self._stamps_ns, self._readings
         held_ns = self._stamps_ns[-1] + min(_HELD_NS, self._max_gap_ns)
         return np.append(self._stamps_ns, held_ns), np.concatenate([self._readings, self._readings[-1:]])
