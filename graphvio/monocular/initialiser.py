@@ -22,6 +22,7 @@ from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, eviden
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
 from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
 from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import located
@@ -152,11 +153,16 @@ class Initialiser:
         """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
         self._fits_no_motion = False
         file = None if self._calibration is None else self._calibration.file(factors)
-        stamps = np.array([stamp for stamp, _, _ in self._keyframes])
-        samples = self._samples_of(stamps, file is None)
+        keyframes = self._keyframes
+        samples = self._samples_of(np.array([stamp for stamp, _, _ in keyframes]), file is None)
+        if file is not None:  # where samples begin too late for some time offsets, these would be out of reach
+            since_ns = samples.stamps_ns[:1] + MAX_TIME_OFFSET_NS
+            keyframes = [keyframe for keyframe in keyframes if (keyframe[0] >= since_ns).all()]
+        stamps = np.array([stamp for stamp, _, _ in keyframes])
+        samples = samples._replace(keyframes_ns=stamps)
         names, landmarks = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1), Landmarks()
         views = []
-        for _, sightings, _ in self._keyframes:
+        for _, sightings, _ in keyframes:
             views.append(names.join(sightings))
             names.note_keyframe()
         n = len(stamps)
@@ -170,7 +176,7 @@ class Initialiser:
         states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases, calibration)
         bias_sigmas = np.repeat([self._gyro_bias_sigma, ACCEL_BIAS_SIGMA], 3)
         prior = first_prior(states, bias_sigmas, np.concatenate([self._gyro_bias, np.zeros(3)]), POSE_SIGMAS)
-        stationary = np.flatnonzero([still for _, _, still in self._keyframes])
+        stationary = np.flatnonzero([still for _, _, still in keyframes])
         landmarks = Landmarks()
         fitting = 1.0
         for _ in range(2):

@@ -10,7 +10,8 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.preintegration import Preintegrated, covering_samples, preintegrate
 
 _MARGIN_NS = 100_000_000
-_HELD_NS = 30_000_000
+MAX_TIME_OFFSET_NS = 30_000_000
+"""By which the time offset of a rig file may be wrong."""
 
 
 class SampleBuffer:
@@ -92,5 +93,5 @@ class SampleBuffer:
         is_exact = is_offset_known and self.time_offset_s == 0.0
         if is_exact or not len(self._stamps_ns):
             return self._stamps_ns, self._readings
-        held_ns = self._stamps_ns[-1] + min(_HELD_NS, self._max_gap_ns)
+        held_ns = self._stamps_ns[-1] + min(MAX_TIME_OFFSET_NS, self._max_gap_ns)
         return np.append(self._stamps_ns, held_ns), np.concatenate([self._readings, self._readings[-1:]])
