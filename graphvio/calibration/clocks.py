@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from graphvio.arrays import Float, Int
 from graphvio.errors import CalibrationError
@@ -123,6 +122,7 @@ def _angular_speeds(trajectory: Trajectory) -> Float:
 
 def _correlations(one: Float, other: Float, least: int) -> tuple[Float, Int]:
     """Correlation coefficients (L,) at lags (L,) of the second series, for overlaps of ``least`` samples or more."""
+    from scipy.signal import fftconvolve  # takes a second to import, and only trajectories need it
 
     def summed(a: Float, b: Float) -> Float:
         """Sum a(i) b(i + lag) over the overlap, for lags from 1 - len(a) on."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import null_space
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from graphvio.arrays import Float
 from graphvio.calibration.consistency import error_covariance, error_of, information
@@ -41,7 +41,7 @@ class Comparison:
     @property
     def limit(self) -> float:
         """Largest statistic that chance explains."""
-        return float(chi2.isf(_CHANCE, len(self.determined)))
+        return float(chdtri(len(self.determined), _CHANCE))
 
     @property
     def agrees(self) -> bool:

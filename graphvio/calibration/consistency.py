@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats takes a second to import
 
 from graphvio.arrays import Bool, Float
 from graphvio.calibration.nuisances import Nuisances
@@ -17,7 +17,7 @@ from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian_inverse
 from graphvio.kernels import kernel, put
 
-LIMIT = float(chi2.ppf(0.999, 6))
+LIMIT = float(2.0 * gammaincinv(3.0, 0.999))  # chi-square of 6
 """Squared Mahalanobis distance from which a pose pair is an outlier."""
 
 _MAX_ROUNDS = 100

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration import paper_method
@@ -21,7 +21,7 @@ from graphvio.geometry import skew, so3_exp, so3_log
 from graphvio.kernels import kernel
 from graphvio.rig import Imu
 
-_LIMIT = float(chi2.isf(1e-3, 3))
+_LIMIT = float(chdtri(3, 1e-3))
 _SIGMAS = 4.0
 _FLOOR_RAD = 1e-3  # systematic: scale and axes of a gyro
 _FLOOR_S = 2e-4
@@ -173,7 +173,7 @@ class _Rotations:
             noise = noise + (self._gyro_variance * duration)[:, None, None] * np.eye(3)
             information = np.linalg.inv(noise)
             squares = np.einsum("ni,nij,nj->n", errors, information, errors)
-            scale = max(float(np.median(squares)) / float(chi2.median(3)), 1.0)  # of the noise
+            scale = max(float(np.median(squares)) / float(chdtri(3, 0.5)), 1.0)  # of the noise
             weight = (squares < scale * _LIMIT).astype(np.float64)
             cost = float(np.minimum(squares, _LIMIT).sum())
             weighted = np.einsum("n,nki,nkl->nil", weight, jacobians, information)

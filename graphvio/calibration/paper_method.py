@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs, inverses
@@ -22,7 +22,7 @@ from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, 
 
 _TRIPLES = 500
 _CANDIDATES = 10  # best triples, which are refined before one is chosen
-_LIMIT = float(chi2.isf(1e-3, 3))
+_LIMIT = float(chdtri(3, 1e-3))
 _TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs has errors of its own
 _MIN_TURN, _MAX_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
 _MIN_TURNED = 3.0  # rms rotation about an axis over the noise of a rotation

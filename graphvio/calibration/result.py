@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import null_space
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from graphvio.arrays import Bool, Float
 from graphvio.calibration.clocks import ClockRelation
@@ -162,8 +162,8 @@ class Calibration:
         given = np.ascontiguousarray(self.rig.left2_T_left1(0, j))
         tangent, square, degrees = self._apart(j, given)
         _, of_swapped, _ = self._apart(j, se3_inverse(given))
-        chance = float(chi2.sf(square, degrees))
-        sigmas = float(norm.isf(0.5 * chance)) if chance > _TINY else float(np.sqrt(square))
+        chance = float(chdtrc(degrees, square))
+        sigmas = float(0.0 - ndtri(0.5 * chance)) if chance > _TINY else float(np.sqrt(square))
         is_off = chance < _CHANCE
         if degrees < 6:  # only to first order are these independent of the undetermined directions
             rotation, translation = np.linalg.norm(tangent.reshape(2, 3), axis=1)

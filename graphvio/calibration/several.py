@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from graphvio.arrays import Float
 from graphvio.calibration import joint
@@ -124,7 +124,7 @@ def place_all(
         for cameras, each in found.items()
     }
     for (i, j), distance in distances.items():
-        if distance > chi2.isf(_CHANCE, 6):
+        if distance > chdtri(6, _CHANCE):
             warnings.append(
                 f"{names[i]} and {names[j]}: all cameras together put them {size_in_words(apart[i, j])} from where "
                 f"these two alone do, more than the noise explains (chi-square {distance:.0f} of 6)"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration import graph
@@ -46,7 +46,7 @@ class Halves:
     @property
     def agree(self) -> bool:
         """Whether chance explains the difference."""
-        return self.statistic <= float(chi2.isf(_CHANCE, 6))
+        return self.statistic <= float(chdtri(6, _CHANCE))
 
 
 class Grown(NamedTuple):
@@ -152,7 +152,7 @@ def dispersion(pairs: PosePairs, errors: Float, jacobians: Float, determined: Fl
         kept = sizes > _MIN_BLOCK_INFORMATION * sizes[-1]
         squares += float(np.sum((directions[:, kept].T @ gradient) ** 2 / sizes[kept]))
         degrees += int(kept.sum())
-    if degrees <= 0 or squares < chi2.isf(chance, degrees):
+    if degrees <= 0 or squares < chdtri(degrees, chance):
         return 1.0
     return max(squares / degrees, 1.0)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
-from scipy.stats import chi2
+from scipy.special import chdtr  # scipy.stats takes a second to import
 
 from graphvio.arrays import Bool, Float
 from graphvio.optimization.optimize import Optimization
@@ -290,7 +290,7 @@ def _plot_kind(axes: Any, kind: Kind, edges: Float) -> None:
     axes.hist(before, bins=edges, histtype="step", color="#f28e1c", linewidth=1.3, label="before")
     some = kind.after if len(kind.after.distances) else kind.before
     dimension = some.dimensions / len(some.distances)
-    share = np.diff(chi2.cdf(edges * dimension, dimension))
+    share = np.diff(chdtr(dimension, edges * dimension))
     middle = np.sqrt(edges[:-1] * edges[1:])
     axes.plot(middle, len(some.distances) * share, color="#111111", linewidth=1.1, linestyle=(0, (4, 2)),
               label="noise as assumed (chi-square)")  # fmt: skip
