@@ -33,7 +33,13 @@ class Consensus(NamedTuple):
 
     left2_T_left1: Float  # (4, 4)
     nuisances: Float  # (M,) values of the nuisance variables
-    squares: Float  # (N,) squared Mahalanobis distances of all pose pairs' errors
+    errors: Float  # (N, 6) of all pose pairs, whitened
+    jacobians: Float  # (N, 6, 6 + M) of these, see `whitened`
+
+    @property
+    def squares(self) -> Float:
+        """Squared Mahalanobis distances (N,) of all pose pairs' errors."""
+        return np.asarray(np.sum(self.errors**2, axis=1))
 
     @property
     def inlier(self) -> Bool:
@@ -53,11 +59,10 @@ def without_outliers(pairs: PosePairs, start: Float, held: Float, nuisances: Nui
         held: orthonormal directions (K, 6), tangent in left1, in which the initial pose is kept.
         nuisances: variables to estimate with the pose.
     """
-    initial = Consensus(start, np.zeros(len(nuisances.sigmas)), np.empty(0))
+    initial = _at(pairs, start, nuisances, np.zeros(len(nuisances.sigmas)))
     graduated = _graduated(pairs, initial, held, nuisances)
     # Where most pose pairs are outliers, a solution for all of them is no good start, but the given one may be.
-    near = _solve(pairs, initial, np.zeros(len(pairs)), 0, held, nuisances)
-    near = _refined(pairs, near, held, nuisances)
+    near = _refined(pairs, initial, held, nuisances)
     return min(graduated, near, key=lambda each: float(np.minimum(each.squares, LIMIT).sum()))
 
 
@@ -88,23 +93,24 @@ def _solve(
     pairs: PosePairs, start: Consensus, weights: Float, max_steps: int, held: Float, nuisances: Nuisances
 ) -> Consensus:
     """Gauss-Newton with weights (N,) of the pose pairs; directions ``held`` (K, 6) stay as they are."""
-    left2_T_left1, values = start.left2_T_left1, start.nuisances
-    free = np.eye(6 + len(values))
+    found = start
+    free = np.eye(6 + len(found.nuisances))
     free[:6, :6] -= held.T @ held
     prior = np.diag(np.concatenate([np.zeros(6), nuisances.sigmas**-2]))
     for _ in range(max_steps):
-        errors, jacobians = whitened(pairs, left2_T_left1, nuisances, values)
-        jacobians = jacobians @ free
+        jacobians = found.jacobians @ free
         normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians) + prior
-        gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors) + prior[:, 6:] @ values
+        gradient = np.einsum("n,nki,nk->i", weights, jacobians, found.errors) + prior[:, 6:] @ found.nuisances
         step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
         step /= max(np.abs(step).max() / _MAX_STEP, 1.0)
-        left2_T_left1 = left2_T_left1 @ se3_exp(step[:6])
-        values = values + step[6:]
+        found = _at(pairs, found.left2_T_left1 @ se3_exp(step[:6]), nuisances, found.nuisances + step[6:])
         if np.abs(step).max() < _CONVERGED:
             break
-    errors, _ = whitened(pairs, left2_T_left1, nuisances, values)
-    return Consensus(left2_T_left1, values, np.sum(errors**2, axis=1))
+    return found
+
+
+def _at(pairs: PosePairs, left2_T_left1: Float, nuisances: Nuisances, values: Float) -> Consensus:
+    return Consensus(left2_T_left1, values, *whitened(pairs, left2_T_left1, nuisances, values))
 
 
 def _weights(squares: Float, sharpness: float) -> Float:
