@@ -86,7 +86,7 @@ def _plot_group(axes: Any, curves: list[Curve], seconds: Float, differences: Flo
         axes.step(seconds, value, where="post", linestyle=_STYLES[style % len(_STYLES)], label=label, **look)
     axes.axhline(0.0, color="#999999", linewidth=0.8, zorder=1)
     axes.set_xlim(0.0, max(float(seconds[-1]), 1e-3))
-    axes.set_title(curves[0].group, fontsize=10, loc="left", pad=4)
+    axes.set_title(curves[0].group, fontsize=10, loc="left", pad=4, y=1.0)  # given, it is not searched for
     axes.set_ylabel(unit.strip())
     axes.tick_params(labelsize=8)
     axes.grid(color="#e2e2e2", linewidth=0.6)
