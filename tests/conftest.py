@@ -1,19 +1,15 @@
 """Fixtures that several test files share."""
 
 import gc
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib
 import pytest
 from hypothesis import settings
-from recordings import half_size_rig
-from rendered import copy_part, rendered_once
-from undrawn import undrawn
 
-from graphvio.simulation import simulate
-
-matplotlib.use("Agg")
+# Fixtures import what they need: the process that hands out the tests needs none of it, and is waited for first.
+os.environ["MPLBACKEND"] = "Agg"
 
 # The first example may compile or load kernels: no deadline. The same examples in each run.
 settings.register_profile("graphvio", deadline=None, derandomize=True)
@@ -48,6 +44,8 @@ def pytest_collection_finish() -> None:
 @pytest.fixture
 def without_plots() -> Iterator[None]:
     """Results have empty plots."""
+    from undrawn import undrawn
+
     with undrawn():
         yield
 
@@ -55,6 +53,10 @@ def without_plots() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def long_room_walk() -> Path:
     """A simulated recording: 10 s in the room, the first of them at a standstill, both pairs of 320x240 and the IMU."""
+    from recordings import half_size_rig
+    from rendered import rendered_once
+
+    from graphvio.simulation import simulate
 
     def write(folder: Path) -> None:
         simulate("room", folder, duration_s=10.0, rig=half_size_rig())
@@ -65,10 +67,16 @@ def long_room_walk() -> Path:
 @pytest.fixture(scope="session")
 def room_walk(long_room_walk: Path) -> Path:
     """The first half of the recording."""
+    from rendered import copy_part, rendered_once
+
     return rendered_once("room", lambda folder: copy_part(long_room_walk, folder, 5.0), "320x240", 5.0)
 
 
 @pytest.fixture(scope="session")
 def vga_walk() -> Path:
     """The same five seconds with images of 640x480, the simulator's own, for claims on accuracy that depend on them."""
+    from rendered import rendered_once
+
+    from graphvio.simulation import simulate
+
     return rendered_once("room", lambda folder: simulate("room", folder, duration_s=5.0, seed=3), "640x480", 5.0)
