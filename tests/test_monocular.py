@@ -526,7 +526,15 @@ def findings_of(estimator: MonocularEstimator, rig: Rig) -> list[Finding]:
     return findings(estimator.calibration, file_prior(rig).covariance)
 
 
-def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_an_exact_one_left_alone() -> None:
+@pytest.fixture(scope="module")
+def exactly_known() -> Flown:
+    """A flight of two cameras that see the same, with an exact rig file."""
+    return fly(moving(), 8.0, rig=overlapping_rig())
+
+
+def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_an_exact_one_left_alone(
+    exactly_known: Flown,
+) -> None:
     rig, errors = overlapping_rig(), []
     trusting = replace(Config(), calibration=CalibrationConfig(online=False))
     for seed in range(3):
@@ -545,7 +553,7 @@ def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_
         theirs, _ = aligned(trusted._replace(poses=trusted.poses[late], truth=trusted.truth[late]))
         assert ours < 0.7 * theirs
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 1.5
-    exact = fly(moving(), 8.0, rig=rig).estimator.calibration
+    exact = exactly_known.estimator.calibration
     assert exact is not None
     assert exact.is_file_exact
     np.testing.assert_array_equal(exact.rig.cameras[1].body_T_cam, rig.cameras[1].body_T_cam)
@@ -605,10 +613,9 @@ def test_a_camera_that_is_turned_in_the_rig_file_does_not_spoil_the_scale(turned
     assert len(off) <= 1  # where it is found only after the views were taken each by itself
 
 
-def test_an_exact_rig_is_trusted_and_the_comparison_ends() -> None:
-    flown = fly(moving(), 3.0, rig=overlapping_rig())
-    assert [kind for kind, _ in flown.events] == [EventKind.SCALE_KNOWN]
-    assert flown.estimator.epoch == 0
+def test_an_exact_rig_is_trusted_and_the_comparison_ends(exactly_known: Flown) -> None:
+    assert [kind for kind, _ in exactly_known.events] == [EventKind.SCALE_KNOWN]
+    assert exactly_known.estimator.epoch == 0
 
 
 @pytest.mark.parametrize("shares", [False, True])
