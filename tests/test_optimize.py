@@ -119,6 +119,7 @@ def test_optimize_one_camera_improves_on_online(of_one_camera: Path) -> None:
     assert session["framesets"] == len(load_trajectory(of_one_camera / "trajectory_optimized.txt"))
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_fleet_one_camera_equals_optimize(of_one_camera: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
     listed, out = tmp_path / "list.txt", tmp_path / "out"
     listed.write_text(f"{walk}\n")

@@ -4,13 +4,15 @@ It is also a preload of dask's workers.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
-import pytest
 from matplotlib.figure import Figure
 
+from graphvio.calibration.report import page
+from graphvio.fleet import cluster
 from graphvio.optimization.report import figures, write
 from graphvio.reporting.figures import png
 from graphvio.results import writer
@@ -23,6 +25,10 @@ def _nothing(*_: Any) -> None:
 
 def _png(figure: Figure | None) -> bytes:
     return b"" if figure is None else png(figure)
+
+
+def _no_pictures(*_: Any) -> dict[str, bytes]:
+    return {}
 
 
 def _empty_file(path: Path, *_: Any, **__: Any) -> None:
@@ -41,15 +47,17 @@ _PLOTS: tuple[tuple[Any, str, Any], ...] = (
     (write, "png", _png),
     (writer, "plot_run", _empty_file),
     (CalibrationHistory, "plot", _empty_file_of),
+    (page, "_pictures", _no_pictures),
 )
 
 
 @contextmanager
 def undrawn() -> Iterator[None]:
-    """Leave the plots of results empty."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module, name, instead in _PLOTS:
-            patch.setattr(module, name, instead)
+    """Leave the plots of results empty, here and in workers that are started here."""
+    preloads = [*cluster.WORKER_PRELOADS, __file__]
+    with ExitStack() as patches:
+        for module, name, instead in (*_PLOTS, (cluster, "WORKER_PRELOADS", preloads)):
+            patches.enter_context(patch.object(module, name, instead))
         yield
 
 

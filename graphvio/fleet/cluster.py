@@ -17,6 +17,8 @@ from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
 RETRIES = 2
+WORKER_PRELOADS = ["graphvio.fleet"]
+"""Modules and files with ``dask_setup`` that workers of this machine load first."""
 _MAX_CONNECT_S = 20.0
 
 
@@ -83,7 +85,7 @@ def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any
                 processes=True,
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
-                preload=["graphvio.fleet"],
+                preload=WORKER_PRELOADS,
             )
         except (OSError, RuntimeError) as error:
             raise FleetError(f"workers cannot be started on this machine ({error})") from None
