@@ -126,45 +126,62 @@ def source_framesets(recording: Path) -> list[FrameSet]:
     return [measurement for measurement in open_source(recording) if isinstance(measurement, FrameSet)]
 
 
-_RECORDER = """
-import sys, time
+_RECORDERS = """
+import os, sys, time
 from pathlib import Path
 import numpy as np
 sys.path.insert(0, {tests!r})
 from recordings import small_rig
 from graphvio import FrameSet, ImuSample
 from graphvio.sessions.writer import SessionWriter
-rig = small_rig(1)
-begin = time.monotonic_ns()
-with SessionWriter(Path({path!r}), rig) as writer:
-    while True:
-        now = time.monotonic_ns()
-        writer.add(ImuSample(now, np.zeros(3), np.array([0.0, 0.0, 9.81])))
-        image = np.full((48, 64), now // 10**6 % 256, np.uint8)
-        writer.add(FrameSet(now, {{0: (image, image)}}))
-        print(now, flush=True)
-        time.sleep(0.005)
+def record(path):
+    with SessionWriter(path, small_rig(1)) as writer, path.with_suffix(".txt").open("w") as stamps:
+        while True:
+            now = time.monotonic_ns()
+            writer.add(ImuSample(now, np.zeros(3), np.array([0.0, 0.0, 9.81])))
+            image = np.full((48, 64), now // 10**6 % 256, np.uint8)
+            writer.add(FrameSet(now, {{0: (image, image)}}))
+            print(now, file=stamps, flush=True)
+            time.sleep(0.005)
+for k in range({count}):
+    pid = os.fork()  # modules are imported once
+    if not pid:
+        record(Path({folder!r}) / f"{{k}}.mcap")
+    print(pid, flush=True)
+for _ in range({count}):
+    print(os.wait()[0], flush=True)
 """
 
 
 def test_killed_recordings_lose_at_most_the_last_second(tmp_path: Path) -> None:
     """Ten of them, at moments of all kinds."""
     moments_s = np.sort(np.random.default_rng(0).uniform(0.8, 3.0, 10))
-    recorders = []
-    for k in range(len(moments_s)):
-        code = _RECORDER.format(tests=str(Path(__file__).parent), path=str(tmp_path / f"{k}.mcap"))
-        recorders.append(subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True))
-    for recorder in recorders:
-        assert recorder.stdout is not None
-        recorder.stdout.readline()  # it has begun
-    begun_s = time.monotonic()
-    for k, (recorder, moment_s) in enumerate(zip(recorders, moments_s, strict=True)):
-        time.sleep(max(begun_s + moment_s - time.monotonic(), 0.0))
-        os.kill(recorder.pid, signal.SIGKILL)
-        assert recorder.stdout is not None
-        last_ns = int(recorder.stdout.read().split()[-2])
-        recorder.wait()
-        check_killed(tmp_path / f"{k}.mcap", last_ns)
+    code = _RECORDERS.format(tests=str(Path(__file__).parent), folder=str(tmp_path), count=len(moments_s))
+    paths = [tmp_path / f"{k}.mcap" for k in range(len(moments_s))]
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert parent.stdout is not None
+    try:
+        recorders = [int(parent.stdout.readline()) for _ in paths]
+        for path in paths:
+            while not stamps_of(path):  # until it has begun
+                time.sleep(0.005)
+        begun_s = time.monotonic()
+        for path, recorder, moment_s in zip(paths, recorders, moments_s, strict=True):
+            time.sleep(max(begun_s + moment_s - time.monotonic(), 0.0))
+            os.kill(recorder, signal.SIGKILL)
+            assert int(parent.stdout.readline()) == recorder  # it is dead
+            check_killed(path, stamps_of(path)[-1])
+        assert parent.wait() == 0
+    finally:
+        if parent.poll() is None:
+            os.killpg(parent.pid, signal.SIGKILL)
+        parent.communicate()
+
+
+def stamps_of(recording: Path) -> list[int]:
+    """What its recorder has noted, a line each, of which the last may not be whole."""
+    noted = recording.with_suffix(".txt")
+    return [int(line) for line in noted.read_text().split("\n")[:-1]] if noted.exists() else []
 
 
 def check_killed(path: Path, last_ns: int) -> None:
