@@ -109,11 +109,19 @@ def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
         parts: of N pose pairs.
         noise_rad: standard deviation of a rotation; axes with no more rotation than this explains are left out.
     """
-    A = (np.eye(3) - parts.R_2).reshape(-1, 3)
-    b = (parts.T_2 - parts.T_1 @ R.T).ravel()  # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
-    left, sizes, right = np.linalg.svd(A, full_matrices=False)
-    turned = sizes > _min_singular_value(sizes, len(parts.R_2), noise_rad)
-    return np.asarray(right[turned].T @ ((left.T @ b)[turned] / sizes[turned]))
+    return np.asarray(translations(R[None], PoseParts(*(part[None] for part in parts)), noise_rad)[0])
+
+
+def translations(R: Float, parts: PoseParts, noise_rad: float) -> Float:
+    """Find M of these, (M, 3), from rotations (M, 3, 3) and N pose pairs each, whose parts are (M, N, ...)."""
+    A = (np.eye(3) - parts.R_2).reshape(len(R), -1, 3)
+    # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
+    b = (parts.T_2 - parts.T_1 @ np.swapaxes(R, 1, 2)).reshape(len(R), -1)
+    found = np.empty((len(R), 3))
+    for m, (left, sizes, right) in enumerate(zip(*np.linalg.svd(A, full_matrices=False), strict=True)):
+        turned = sizes > _min_singular_value(sizes, parts.R_2.shape[1], noise_rad)
+        found[m] = right[turned].T @ ((left.T @ b[m])[turned] / sizes[turned])
+    return found
 
 
 def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
@@ -131,9 +139,18 @@ def jacobians(parts: PoseParts, R: Float) -> Float:
     """Differentiate the alignment errors: (N, 3, 6) by ``[dt, dq]``; dq is half a rotation vector, from the left."""
     made = np.empty((len(parts.R_1), 3, 6))
     made[:, :, :3] = np.swapaxes(parts.R_1, 1, 2) - np.eye(3)
-    moved = np.einsum("nji,nj->ni", parts.R_2, parts.T_2)
-    made[:, :, 3:] = 2.0 * np.einsum("ji,njk->nik", R, _crosses(moved))
+    made[:, :, 3:] = _by_turn(R, _moved_crosses(parts))
     return made
+
+
+def _by_turn(R: Float, crosses: Float) -> Float:
+    """Differentiate the alignment errors by dq: (N, 3, 3)."""
+    return np.asarray(2.0 * np.einsum("ji,njk->nik", R, crosses))
+
+
+def _moved_crosses(parts: PoseParts) -> Float:
+    """Return the matrices (N, 3, 3) of the cross products with ``R_2^T T_2``."""
+    return _crosses(np.einsum("nji,nj->ni", parts.R_2, parts.T_2))
 
 
 def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tuple[Float, Float]:
@@ -144,9 +161,9 @@ def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tupl
     damping, turned = _FIRST_DAMPING, _turned_axes(parts, noise_rad)
     errors = alignment_errors(parts, R, t)
     cost = float(np.sum(errors**2))
+    by_t, crosses = jacobians(parts, R)[:, :, :3] @ turned, _moved_crosses(parts)
     for _ in range(_ITERATIONS):
-        J = jacobians(parts, R)
-        J = np.concatenate([J[:, :, :3] @ turned, J[:, :, 3:]], axis=2).reshape(-1, turned.shape[1] + 3)
+        J = np.concatenate([by_t, _by_turn(R, crosses)], axis=2).reshape(-1, turned.shape[1] + 3)
         normal, gradient = J.T @ J, J.T @ errors.ravel()
         damped = normal + damping * np.diag(normal.diagonal() + _TINY * normal.trace())
         step = -np.linalg.lstsq(damped, gradient, rcond=1e-15)[0]
@@ -261,12 +278,8 @@ def _best_triples(weighted: _Weighted, rng: np.random.Generator) -> list[tuple[F
     triples = rng.permuted(np.broadcast_to(fit, (_TRIPLES, len(fit))), axis=1)[:, :MIN_PAIRS]
     _, vectors = np.linalg.eigh(normals[triples].sum(axis=1))
     R = np.array([rotation_from_quat_wxyz(np.ascontiguousarray(q)) for q in vectors[:, :, 0]])
-    t = np.array(
-        [
-            -each.T @ translation(each, parts.select(triple), weighted.noise_rad)
-            for each, triple in zip(R, triples, strict=True)
-        ]
-    )
+    T = translations(R, PoseParts(*(part[triples] for part in parts)), weighted.noise_rad)
+    t = np.array([-each.T @ of_each for each, of_each in zip(R, T, strict=True)])
     best = np.argsort(weighted.costs(R, t, _TRIPLE_LIMIT), kind="stable")[:_CANDIDATES]
     return [(R[k], t[k]) for k in best]
 
