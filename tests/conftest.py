@@ -20,12 +20,13 @@ settings.load_profile("graphvio")
 _LONGEST = (
     "page_code", "outages", "optimize", "monocular", "fleet", "cli_slam", "end_to_end", "examples",
     "frontend_covariance", "live", "recorded_calibration", "optimization", "calibrate", "calibration_trajectories",
-    "mapping", "start_in_motion", "self_calibration", "fleet_s3", "hard_moments", "calibration_methods", "corridor",
-    "tutorials", "kernels", "cli_live", "ros2_source", "cli_serve", "simulation_scenes", "slam_service", "json_output",
-    "calibration_memory", "calibration_several", "backend_shared_error", "convert", "calibration_pair", "keyframes",
-    "viewer_web", "unsynchronised", "docs", "backend_smoother", "live_sources", "overlaps", "slam_single_cameras",
-    "sessions", "benchmark", "slam_fuzz", "nav_frame", "warmup", "site", "live_oak", "single_cameras", "cli_warming",
-    "ekf_graph", "cli_calibrate_trajectories", "frontend_lucas_kanade",
+    "mapping", "odometry", "start_in_motion", "self_calibration", "fleet_s3", "hard_moments", "calibration_methods",
+    "corridor", "tutorials", "kernels", "cli_live", "ros2_source", "cli_serve", "simulation_scenes", "slam_service",
+    "json_output", "calibration_memory", "calibration_several", "backend_shared_error", "convert", "calibration_pair",
+    "keyframes", "viewer_web", "unsynchronised", "docs", "backend_smoother", "live_sources", "overlaps",
+    "slam_single_cameras", "sessions", "benchmark", "slam_fuzz", "nav_frame", "warmup", "site", "live_oak",
+    "single_cameras", "cli_warming", "ekf_graph", "cli_calibrate_trajectories", "frontend_lucas_kanade", "cli_program",
+    "lens_models", "map_frame", "ekf_estimator", "image_masks", "colmap_export", "clock_map",
 )  # fmt: skip
 _RANKS = {f"test_{name}": rank for rank, name in enumerate(_LONGEST)}
 
