@@ -228,6 +228,7 @@ def _costs(
     covariance_2: Float,
     limit: float,
 ) -> Float:
+    """Sum the squared Mahalanobis distances of the alignment errors, as `_Weighted.costs` describes."""
     costs, jacobian, root, error = np.zeros(len(R)), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
     for m in range(len(R)):
         for n in range(len(R_1)):
