@@ -578,6 +578,27 @@ def test_first_window_by_a_wrong_file_finds_a_time_offset_of_either_sign(
     assert abs(estimate.time_offset_s - 1e-3 * offset_ms) < 3.0 * estimate.sigmas[-1]
 
 
+def test_an_epoch_after_the_dark_begins_with_the_calibration_that_was_learnt() -> None:
+    """Without it, this one is off by more than 1.5 cm: its first window is as far from the truth as the file."""
+    rig = overlapping_rig()
+    _, written = wrong_by(rig, seed=0, level=3)
+    strict = replace(Config(), smoother=replace(Config().smoother, lost_position_sigma_m=0.05))
+    flown = fly(
+        moving(),
+        9.0,
+        rig=rig,
+        believed=written,
+        config=strict,
+        share=lambda t: 0.0 if 4.0 <= t < 6.5 else 1.0,
+        offset_ms=8,
+    )
+    assert [kind for kind, _ in flown.events] == [EventKind.SCALE_KNOWN, EventKind.LOST, EventKind.SCALE_KNOWN]
+    after = flown.stamps_s > 6.5
+    error_m, scale = aligned(flown._replace(poses=flown.poses[after], truth=flown.truth[after]))
+    assert error_m < 0.005
+    assert abs(scale - 1.0) < 0.005
+
+
 def wrong_by(rig: Rig, seed: int, level: int = 2) -> tuple[Float, Rig]:
     """Return the difference of a rig from a file that is wrong by a level's standard deviations, and the file."""
     sampled = draw(rig, CalibrationError.of_level(level, ["focal", "principal-point", "pair-transform"]), seed)

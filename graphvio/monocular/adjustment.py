@@ -12,7 +12,7 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.states import BIASES, GRAVITY, Prior, States, columns_of, inertial_columns, visual_columns
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located, visual_equations
-from graphvio.self_calibration.evidence import Evidence
+from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
 
 ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
@@ -66,7 +66,7 @@ class Adjusted(NamedTuple):
 
 
 def equations(
-    measured: Measurements, states: States, landmarks: Float, prior: Prior | None, file: Float | None = None
+    measured: Measurements, states: States, landmarks: Float, prior: Prior | None, file: Gaussian | None = None
 ) -> Equations:
     """Linearise all errors of a window.
 
@@ -75,8 +75,8 @@ def equations(
         states: K of them.
         landmarks: (L, 3).
         prior: from before the window.
-        file: (F, F) information of the rig file on the calibration, which is unknown then; None where the calibration
-            is taken for known.
+        file: what the rig file says of the calibration, which is unknown then; None where the calibration is taken for
+            known.
     """
     n, n_cameras, n_free = len(states.poses), states.n_cameras, 0 if file is None else len(states.calibration)
     eliminated = Eliminated.empty(measured.structure, n_cameras if n_free else 0)
@@ -116,10 +116,11 @@ def equations(
         gradient[columns] += (prior.gradient + pull)[:size]
         cost += float((prior.gradient * off + 0.5 * off * pull).sum())
     if file is not None:
-        pull = times(file, states.calibration)
-        hessian[known:, known:] += file
+        away = states.calibration - file.mean
+        pull = times(file.information, away)
+        hessian[known:, known:] += file.information
         gradient[known:] += pull
-        cost += 0.5 * float((states.calibration * pull).sum())
+        cost += 0.5 * float((away * pull).sum())
     return Equations(hessian, gradient, cost, errors2, inertial.errors2, eliminated)
 
 
@@ -129,7 +130,7 @@ def adjust(
     landmarks: Float,
     prior: Prior | None,
     max_steps: int,
-    file: Float | None = None,
+    file: Gaussian | None = None,
 ) -> Adjusted:
     """Minimise all errors of a window by Levenberg and Marquardt; arguments are those of `equations`.
 
@@ -161,19 +162,19 @@ def adjust(
     return Adjusted(states, landmarks, at)
 
 
-def evidence_of(at: Equations, states: States, file: Float) -> Evidence:
+def evidence_of(at: Equations, states: States, file: Gaussian) -> Evidence:
     """Return what a window says of the calibration, from equations for which that is unknown.
 
     Args:
         at: equations at the states.
         states: adjusted.
-        file: (F, F) information of the rig file that is in the equations, and not in the evidence.
+        file: what the rig file says, which is in the equations, and not in the evidence.
     """
-    hessian, n_free = at.hessian.copy(), len(file)
+    hessian, n_free = at.hessian.copy(), len(file.mean)
     known = len(hessian) - n_free
-    hessian[known:, known:] -= file
+    hessian[known:, known:] -= file.information
     gradient = at.gradient.copy()
-    gradient[known:] -= times(file, states.calibration)
+    gradient[known:] -= times(file.information, states.calibration - file.mean)
     gain = solve_rows(hessian[:known, :known], hessian[known:, :known].copy())
     information = hessian[known:, known:] - product(gain, hessian[:known, known:].copy())
     information = 0.5 * (information + information.T)

@@ -49,12 +49,12 @@ class WindowCalibration:
             np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]), whole.group[self._rows]
         )
         self._whole = whole
-        self._evidence = Evidence.none(len(self._rows))
+        self._evidence = self._kept = Evidence.none(len(self._rows))
         self._bias_walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
         self.factors = self._first_factors = self.exact_factors
         self.log_bayes_factor = 0.0
-        self._files: dict[tuple[float, ...], Float] = {}
+        self._files: dict[tuple[float, ...], Gaussian] = {}
 
     @property
     def size(self) -> int:
@@ -82,13 +82,17 @@ class WindowCalibration:
             return [self.factors]
         return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]
 
-    def file(self, factors: Float) -> Float | None:
-        """Return the information (F, F) of a rig file that is wrong by some factors (G,), None where it is exact."""
+    def file(self, factors: Float) -> Gaussian | None:
+        """Return what is known before an epoch: by a rig file that is wrong by some factors (G,), and earlier epochs.
+
+        None where the file is exact.
+        """
         if self.is_exact(factors):
             return None
         key = tuple(factors.tolist())
         if key not in self._files:
-            self._files[key] = solve_rows(self._prior.with_factors(factors), np.eye(self.size))
+            information = solve_rows(self._prior.with_factors(factors), np.eye(self.size)) + self._kept.information
+            self._files[key] = Gaussian(solve_rows(information, self._kept.vector.reshape(1, -1))[0], information)
         return self._files[key]
 
     def is_plausible(self, difference: Float) -> bool:
@@ -110,12 +114,22 @@ class WindowCalibration:
 
     def likeliest_factors(self, evidence: Evidence) -> Float:
         """Return by which factors (G,) the rig file is most likely wrong, given that it is not exact."""
-        found, _ = evidence.file_factors(self._prior, np.zeros(self._prior.n_groups))
+        found, _ = self._kept.plus(evidence).file_factors(self._prior, np.zeros(self._prior.n_groups))
         return np.maximum(found, _MIN_FACTOR)
 
     def begin(self, factors: Float) -> None:
         """Begin with a window that is adjusted with some factors (G,)."""
         self.factors = self._first_factors = factors
+
+    def keep(self) -> None:
+        """Keep what is known beyond the end of an epoch."""
+        self._kept = self._evidence
+        self._files.clear()
+
+    def forget(self) -> None:
+        """Forget what ended epochs have shown: no motion fits it."""
+        self._kept = Evidence.none(self.size)
+        self._files.clear()
 
     def update(self, evidence: Evidence) -> bool:
         """Take what the window and what left it say of the calibration.
@@ -123,9 +137,9 @@ class WindowCalibration:
         Returns:
             Whether the factors have changed.
         """
-        before, self._evidence = self.factors, evidence
-        found, self.log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
-        if not self.is_file_exact or (found != EXACT).any():
+        before, self._evidence = self.factors, self._kept.plus(evidence)
+        found, self.log_bayes_factor = self._evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
+        if not (self.is_file_exact and self.is_exact(found)):
             # Errors that the tracks of one camera have in common look like those of a lens: it is not as wrong as any.
             of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
             self.factors = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)

@@ -51,6 +51,7 @@ from graphvio.monocular.states import Prior, States
 from graphvio.monocular.structure import Structure
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.evidence import Gaussian
 
 _FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
@@ -240,7 +241,7 @@ class MonocularEstimator:
             return False
         self._latest_ns = stamp_ns
         if not is_covered:
-            self._lose(stamp_ns, "the IMU does not cover the step to this frameset")
+            self._lose(stamp_ns, "the IMU does not cover the step to this frameset", is_sound=True)
             return False
         if window is None:
             return False
@@ -377,8 +378,8 @@ class MonocularEstimator:
         return StateUpdate(status, outliers=dropped)
 
     @property
-    def _file(self) -> Float | None:
-        """Information of the rig file on the calibration, None where that is taken for exact."""
+    def _file(self) -> Gaussian | None:
+        """What is known of the calibration before the epoch, None where the rig file is taken for exact."""
         return None if self._calibration is None else self._calibration.file(self._calibration.factors)
 
     def _doubts_file(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
@@ -387,7 +388,8 @@ class MonocularEstimator:
             return False
         file, at = self._file, adjusted.equations
         if file is None:
-            file = np.zeros((self._calibration.size, self._calibration.size))
+            n = self._calibration.size
+            file = Gaussian(np.zeros(n), np.zeros((n, n)))
             at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
         return self._calibration.update(evidence_of(at, adjusted.states, file))
 
@@ -488,16 +490,22 @@ class MonocularEstimator:
             return Status.TRACKING
         gained_m = float(np.sqrt(max(sigma_m**2 - self._tracked_sigma_m**2, 0.0)))
         if gained_m > self._config.smoother.lost_position_sigma_m:
-            self._lose(stamp_ns, f"position uncertain by {gained_m:.2f} m since vision last constrained it")
+            why = f"position uncertain by {gained_m:.2f} m since vision last constrained it"
+            self._lose(stamp_ns, why, is_sound=True)
             return Status.LOST
         return Status.COASTING
 
     # ------------------------------------------------------------------ breaks, and the IMU
 
-    def _lose(self, stamp_ns: int, why: str) -> None:
-        """End the epoch: the next one begins once the scale is known again."""
+    def _lose(self, stamp_ns: int, why: str, is_sound: bool = False) -> None:
+        """End the epoch: the next one begins once the scale is known again.
+
+        What is known of the calibration is kept where the epoch ends with a sound window.
+        """
         if self._window is not None:
             self.finish()
+            if is_sound and self._calibration is not None:
+                self._calibration.keep()
             self.epoch += 1
             self._report(stamp_ns, EventKind.LOST, why)
         self._window, self._before, self._contradicted_since_ns = None, None, None

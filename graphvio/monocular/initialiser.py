@@ -26,6 +26,7 @@ from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
 from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
 from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import located
+from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
 
 MAX_KEYFRAMES = 14
@@ -142,12 +143,12 @@ class Initialiser:
         """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
         if self._calibration is None:
             return [_NO_FACTORS]
-        candidates = self._calibration.candidates
         self._contradicted += self._fits_no_motion
         if not (self._doubts_file and self._fits_no_motion) or self._contradicted < self._doubted_at:
-            return candidates[:1]
+            return self._calibration.candidates[:1]
         self._doubted_at *= 2  # each attempt takes as long as many framesets
-        return candidates
+        self._calibration.forget()
+        return self._calibration.candidates
 
     def _solved(self, factors: Float) -> Window | None:
         """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
@@ -173,6 +174,8 @@ class Initialiser:
         guess = first_guess(samples, structure, self._cameras, self._gyro_bias)
         biases = np.concatenate([guess.gyro_bias, np.zeros(3)])
         calibration = np.zeros(0 if self._calibration is None else self._calibration.size)
+        if file is not None:
+            calibration = file.mean
         states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases, calibration)
         bias_sigmas = np.repeat([self._gyro_bias_sigma, ACCEL_BIAS_SIGMA], 3)
         prior = first_prior(states, bias_sigmas, np.concatenate([self._gyro_bias, np.zeros(3)]), POSE_SIGMAS)
@@ -259,7 +262,7 @@ def shared_points(sightings: Mapping[int, Sighting]) -> int:
     return sum(len(seen.rows) for sighting in sightings.values() for seen in sighting.elsewhere)
 
 
-def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior, file: Float | None) -> str:
+def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior, file: Gaussian | None) -> str:
     """Say whether another scale fits as well as the one that was found, or nothing.
 
     A covariance is of one minimum, and says nothing of others: the window is adjusted again from other scales.

@@ -92,6 +92,10 @@ class Evidence(NamedTuple):
         """Return the likelihood of no measurements."""
         return Evidence(np.zeros((size, size)), np.zeros(size))
 
+    def plus(self, other: Evidence) -> Evidence:
+        """Return the likelihood of these measurements and others."""
+        return Evidence(self.information + other.information, self.vector + other.vector)
+
     def given(self, prior: FilePrior, factors: Float) -> Gaussian:
         """Return the posterior, where the rig file is wrong by factors (G,) times its standard deviations."""
         information = self.information + np.linalg.inv(prior.with_factors(factors))
