@@ -20,7 +20,7 @@ from graphvio.frontend.images import ImageMask
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
-from graphvio.measurements.events import Event
+from graphvio.measurements.events import Event, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
@@ -28,9 +28,11 @@ from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
+from graphvio.odometry.fixed_calibration import FixedCalibration
 from graphvio.odometry.imu_of_framesets import ImuOfFramesets
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
+from graphvio.odometry.pairs_calibration import PairsCalibration
 from graphvio.odometry.singles_calibration import SinglesCalibration
 from graphvio.odometry.step import Step
 from graphvio.odometry.synchroniser import Synchroniser
@@ -74,6 +76,21 @@ def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | Filte
     return FilterEstimator if config.fusion.estimator == "filter" else SmootherEstimator
 
 
+def _calibration_of(
+    rig: Rig,
+    config: Config,
+    frontend: VisualFrontend,
+    synchroniser: Synchroniser,
+    estimator: StateEstimator,
+    report: Report,
+) -> OnlineCalibration:
+    if not config.estimates_calibration:
+        return FixedCalibration()
+    if isinstance(estimator, MonocularEstimator):
+        return SinglesCalibration(rig, frontend, synchroniser, estimator, report)
+    return PairsCalibration(rig, config, frontend, synchroniser, estimator, report)
+
+
 class Odometry:
     """Visual-inertial odometry of a rig of stereo pairs and single cameras.
 
@@ -109,8 +126,8 @@ class Odometry:
         self._imu = ImuOfFramesets(rig, self.config, self._synchroniser, self._estimator, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
-        self._calibration = (OnlineCalibration if rig.pairs else SinglesCalibration)(
-            rig, self.config, self._frontend, self._synchroniser, self.report
+        self._calibration = _calibration_of(
+            rig, self.config, self._frontend, self._synchroniser, self._estimator, self.report
         )
         self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
@@ -330,8 +347,7 @@ class Odometry:
     @timed("update")
     def _gate(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Test the innovations, and insert the measurements that pass (section 5)."""
-        visual = self._calibration.with_allowance(visual, self._estimator)
-        applied = self._estimator.apply(visual, is_stationary)
+        applied = self._estimator.apply(self._calibration.with_allowance(visual), is_stationary)
         if applied.needs_keyframe:
             self._frontend.start_keyframe()
         return applied
@@ -355,7 +371,7 @@ class Odometry:
 
     def _recalibrate(self, stamp_ns: int, visual: VisualResult, status: Status) -> None:
         """Let the calibration take what the cameras see, and use the one that comes into force."""
-        self._calibration.add(stamp_ns, visual.quality, status, self._estimator)
+        self._calibration.add(stamp_ns, visual.quality, status)
         old_R_new = self._calibration.update(stamp_ns)
         if old_R_new is not None:
             self._calibration.correct_pose(self._nav.turn(stamp_ns, self._estimator.state().nav_T_body, old_R_new))

@@ -1,19 +1,19 @@
-"""Calibration of a rig of single cameras: the estimator's window knows it, and other stages and people learn of it."""
+"""The calibration of a rig of single cameras: the estimator's window knows it, and passes it on by way of this."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from graphvio.arrays import Float
-from graphvio.backend.estimator import StateEstimator
-from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
-from graphvio.measurements.motion import Quality
+from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.monocular.estimator import MonocularEstimator
-from graphvio.odometry.online_calibration import OnlineCalibration
+from graphvio.odometry.online_calibration import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
@@ -24,66 +24,87 @@ from graphvio.self_calibration.prior import file_prior
 _KEYFRAME_INTERVAL_S = 0.25  # of the windows for a calibration from the whole recording
 
 
-class SinglesCalibration(OnlineCalibration):
-    """Passes on what a `MonocularEstimator` finds: the time offset to the synchroniser, contradictions as events."""
+class SinglesCalibration:
+    """An `OnlineCalibration` of a rig of single cameras and an IMU, whose `MonocularEstimator` estimates it.
+
+    The time offset is passed on to the synchroniser, contradictions of the rig file to people. Innovation tests and the
+    pose's covariance know of the calibration's errors, since these are states.
+
+    Args:
+        rig: Of the rig file.
+        frontend: Has the tracks.
+        synchroniser: Takes a corrected time offset.
+        estimator: Estimates the calibration.
+        report: Receives events.
+    """
 
     def __init__(
-        self, rig: Rig, config: Config, frontend: VisualFrontend, synchroniser: Synchroniser, report: Report
+        self,
+        rig: Rig,
+        frontend: VisualFrontend,
+        synchroniser: Synchroniser,
+        estimator: MonocularEstimator,
+        report: Report,
     ) -> None:
-        super().__init__(rig, config, frontend, synchroniser, report)
+        assert rig.imu is not None
+        self._imu = rig.imu
+        self._frontend = frontend
+        self._synchroniser = synchroniser
+        self._estimator = estimator
+        self._report = report
         self._file_covariance = file_prior(rig).covariance
         self._estimate: CalibrationEstimate | None = None
-        self._estimator: MonocularEstimator | None = None
-        self._was_wrong = False
-        self._on_full_window: Callable[[FullWindow], None] | None = None
+        self._was_wrong = self._is_reported = False
+        self._epoch = 0
         self._collector = WindowCollector(rig)
+        self._on_full_window: Callable[[FullWindow], None] | None = None
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
-        """What is known of the calibration now, or None before the first pose and where it is not estimated."""
+        """What is known of the calibration now, or None before the first pose."""
         return self._estimate
 
     @property
     def findings(self) -> list[Finding]:
-        """What is known of each part of the calibration; empty before the first pose, and where it is not estimated."""
+        """What is known of each part of the calibration; empty before the first pose."""
         return [] if self._estimate is None else findings(self._estimate, self._file_covariance)
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Register a function that gets windows of keyframes, for a calibration from the whole recording."""
+        """Collect windows for a function from now on: the estimator's own are others."""
         self._on_full_window = on_window
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Take an IMU sample as it was measured."""
+        """Take an IMU sample for the windows."""
         if self._on_full_window is not None:
             self._collector.add_sample(sample)
 
-    def add(self, stamp_ns: int, quality: Quality, status: Status, estimator: StateEstimator) -> None:
-        """Take note of the estimator, which has been updated by the newest frameset, and of what the cameras see."""
-        assert isinstance(estimator, MonocularEstimator)
-        self._estimator = estimator
+    def with_allowance(self, visual: VisualResult) -> VisualResult:
+        """Return what vision measured, as it is: the window allows for errors of the calibration."""
+        return visual
+
+    def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
+        """Take a frameset for the windows."""
         if self._on_full_window is None:
             return
         if len(self._collector.keyframes) >= WINDOW:  # by now the IMU covers the last one
             window, self._collector.keyframes = tuple(self._collector.keyframes), []
             self._on_full_window(FullWindow(window, self._collector.samples_of(window), FIRST_SIGMA_PX))
-        if estimator.epoch != self._epoch:
-            self._epoch = estimator.epoch
+        if self._estimator.epoch != self._epoch:
+            self._epoch = self._estimator.epoch
             self._collector.restart()
         if status is not Status.TRACKING:
             return
-        views = self._views_at(stamp_ns)
+        views = views_at(self._frontend, stamp_ns)
         if self._collector.is_keyframe(stamp_ns, views, _KEYFRAME_INTERVAL_S):
-            self._collector.add(stamp_ns, estimator.state().nav_T_body, views)
+            self._collector.add(stamp_ns, self._estimator.state().nav_T_body, views)
 
-    def update(self, stamp_ns: int) -> Float | None:
-        """Pass on what has been found since the last call; returns None, since body stays where it is."""
-        assert self._estimator is not None
+    def update(self, stamp_ns: int) -> None:
+        """Pass on what has been found since the last call; body stays where it is."""
         estimate = self._estimator.calibration
         if estimate is None or estimate is self._estimate:
-            return None
+            return
         self._estimate = estimate
-        assert self._rig.imu is not None
-        shift_s = self._rig.imu.time_offset_s + estimate.time_offset_s - self._synchroniser.time_offset_s
+        shift_s = self._imu.time_offset_s + estimate.time_offset_s - self._synchroniser.time_offset_s
         self._synchroniser.shift_imu(shift_s)
         self._estimator.shift_samples(round(shift_s * 1e9))
         wrong = contradiction(self.findings)
@@ -91,4 +112,13 @@ class SinglesCalibration(OnlineCalibration):
             self._is_reported = True
             self._report(stamp_ns, EventKind.CALIBRATION_CORRECTED, f"{wrong}; corrected from now on")
         self._was_wrong = wrong is not None
-        return None
+
+    def correct_pose(self, turned: Float) -> None:
+        """Do nothing: `update` asks for no change of the pose."""
+
+    def pose_covariance(self, odom_T_body: Float) -> Float:
+        """Return zero: the state's covariance has what errors of the calibration do."""
+        return np.zeros((6, 6))
+
+    def close(self) -> None:
+        """Do nothing: nothing runs beside the odometry."""

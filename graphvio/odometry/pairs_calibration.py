@@ -1,0 +1,179 @@
+"""The calibration of a rig with stereo pairs: estimated beside the state, and used by the other stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.estimator import StateEstimator
+from graphvio.config import Config
+from graphvio.frontend.visual import VisualFrontend
+from graphvio.geometry import so3_log
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.motion import Quality, VisualResult
+from graphvio.measurements.sensors import ImuSample
+from graphvio.odometry.innovation_allowance import InnovationAllowance
+from graphvio.odometry.online_calibration import views_at
+from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.rig import Rig
+from graphvio.self_calibration.collector import FullWindow
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.findings import Finding, contradiction
+from graphvio.self_calibration.imu_correction import ImuCorrection
+from graphvio.self_calibration.online import SelfCalibration
+
+_MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
+_MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
+_MAX_TURN_RAD = np.deg2rad(0.3)  # of the cameras in body, up to which motions are measured from references as before
+_AVERAGED = 100  # samples, whose mean specific force is about that of gravity
+
+
+class PairsCalibration:
+    """An `OnlineCalibration` of a rig with at least one stereo pair, by `SelfCalibration`.
+
+    Args:
+        rig: Of the rig file.
+        config: Configuration of all stages.
+        frontend: Has the tracks, and takes corrected cameras.
+        synchroniser: Takes corrections of the IMU and its time offset.
+        estimator: Has the state.
+        report: Receives events.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        config: Config,
+        frontend: VisualFrontend,
+        synchroniser: Synchroniser,
+        estimator: StateEstimator,
+        report: Report,
+    ) -> None:
+        self._rig = rig
+        self._frontend = frontend
+        self._synchroniser = synchroniser
+        self._estimator = estimator
+        self._report = report
+        self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
+        self._mean_force: Float = np.zeros(3)  # of the first samples
+        self._averaged = 0
+        self._epoch = 0
+        self._is_reported = False
+        self._restarts = 0  # of the calibration, that were reported
+        self._reported: set[str] = set()  # pairs
+        self._calibration = SelfCalibration(rig)
+        self._allowance = None if rig.imu is None else InnovationAllowance(rig)
+        self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
+        self._margin_px = self._epipolar_margin_px()
+        frontend.recalibrate(rig, self._margin_px)
+
+    @property
+    def estimate(self) -> CalibrationEstimate:
+        """What is known of the calibration now."""
+        return self._calibration.estimate
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is known of each part of the calibration."""
+        return self._calibration.findings()
+
+    def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
+        """Register a function that gets each window before it is adjusted for the last time."""
+        self._calibration.on_full_window = on_window
+
+    def add_sample(self, sample: ImuSample) -> None:
+        """Take an IMU sample; the first ones show the force at which scale and axes may be wrong."""
+        self._calibration.add_sample(sample)
+        if self._averaged < _AVERAGED:
+            self._averaged += 1
+            self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
+
+    def with_allowance(self, visual: VisualResult) -> VisualResult:
+        """Return motions with what errors of the calibration make them contradict the IMU by."""
+        return visual if self._allowance is None else self._allowance.allow(visual, self._estimator)
+
+    def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
+        """Take a frameset as a keyframe to be, where its pose is of use."""
+        calibration, estimator = self._calibration, self._estimator
+        if self._allowance is not None:
+            self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, calibration.widest)
+        if status not in (Status.TRACKING, Status.INITIALISING) or quality is Quality.FAILED:
+            return
+        if estimator.epoch != self._epoch:
+            self._epoch = estimator.epoch
+            calibration.start_window()
+        views = views_at(self._frontend, stamp_ns)
+        calibration.add_frameset(stamp_ns, estimator.state().nav_T_body, views, quality is Quality.WEAK)
+
+    def update(self, stamp_ns: int) -> Float | None:
+        """Give cameras to the front-end, and the IMU's scale, axes and time offset to the synchroniser."""
+        has_changed = self._calibration.update()
+        if self._calibration.restarts > self._restarts:
+            self._restarts = self._calibration.restarts
+            self._report(
+                stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated again"
+            )
+        margin_px = self._epipolar_margin_px()
+        if not has_changed and margin_px == self._margin_px:
+            return None
+        self._margin_px = margin_px
+        self._report_findings(stamp_ns)
+        self._frontend.recalibrate(self.estimate.rig, margin_px, self._calibration.extrinsics)
+        self._correct_imu()
+        return self._turn()
+
+    def correct_pose(self, turned: Float) -> None:
+        """Count the change as error that motions until now no longer have."""
+        self._calibration.correct_pose(turned)
+
+    def pose_covariance(self, odom_T_body: Float) -> Float:
+        """Return what the errors that are left have done to the motions until now."""
+        return self._calibration.pose_covariance(odom_T_body)
+
+    def close(self) -> None:
+        """End the thread of the adjustments."""
+        self._calibration.close()
+
+    def _correct_imu(self) -> None:
+        """Let the synchroniser correct samples as the calibration in force has it."""
+        if self._rig.imu is None:
+            return
+        self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
+        if self._corrects_time_offset:
+            wanted_s = self._rig.imu.time_offset_s + self.estimate.time_offset_s
+            self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
+
+    def _turn(self) -> Float | None:
+        """Return how the body of the calibration in force is turned, see `OnlineCalibration.update`."""
+        old_R_left, new_R_left = self._body_R_first_left, self.estimate.rig.pairs[0].left.body_T_cam[:3, :3]
+        self._body_R_first_left = new_R_left
+        if self._restarts or np.array_equal(new_R_left, old_R_left):
+            return None
+        old_R_new: Float = old_R_left @ new_R_left.T
+        if self._rig.imu is not None and np.linalg.norm(so3_log(old_R_new)) > _MAX_TURN_RAD:
+            # Measured again from an older reference, the way would have a jump that no IMU can follow.
+            self._frontend.start_keyframe()
+        return old_R_new
+
+    def _report_findings(self, stamp_ns: int) -> None:
+        """Report once that the rig file is wrong beyond 5 sigma, and each pair that is not where the file has it."""
+        found = self.findings
+        wrong = contradiction(found)
+        if wrong is not None and self._calibration.is_confirmed and not self._is_reported:
+            self._is_reported = True
+            self._report(stamp_ns, EventKind.CALIBRATION_CORRECTED, f"{wrong}; corrected from now on")
+        for finding in found:
+            pair, _, kind = finding.part.partition(", ")
+            if finding.is_significant and " against " in kind and pair not in self._reported:
+                self._reported.add(pair)
+                self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; corrected for this run")
+
+    def _epipolar_margin_px(self) -> float:
+        """Return by how much epipolar lines may be off: by the rig file's errors until these are estimated."""
+        if self._calibration.is_trusted:
+            return 0.0
+        sigma_px = max(self._rig.calibration_sigmas.epipolar_px(pair.left.focal_px) for pair in self._rig.pairs)
+        return min(_MARGIN_SIGMAS * sigma_px, _MAX_MARGIN_PX)
