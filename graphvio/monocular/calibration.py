@@ -10,7 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.states import StateCovariance
 from graphvio.linear_algebra import cholesky, solve_rows
+from graphvio.monocular.adjustment import Adjusted, Measurements, equations, evidence_of
+from graphvio.monocular.states import Prior, States
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
@@ -23,23 +26,28 @@ _MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts o
 _FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
 _MAX_SIGMAS = 4.0  # no file is so wrong: the window is
 _WALK = 0.01  # in one second, as a share of the file's standard deviations
+_ESTIMATE_EVERY_NS = 1_000_000_000
 
 
 class WindowCalibration:
     """What is known of the calibration of a rig of single cameras and an IMU.
 
-    The difference from the rig file is ``[cameras C * SINGLE, IMU without its biases 19]``.
+    The difference from the rig file is ``[cameras C * SINGLE, IMU without its biases 19]``, or empty where the file is
+    taken as it is.
 
     Args:
         rig: of the rig file, with how far its calibration is known.
+        is_estimated: whether the file may turn out to be wrong.
 
     Attributes:
+        size: number F of parameters, 0 where they are not estimated.
         factors: (G,) by which the file's errors exceed its standard deviations, of lenses and of places with the IMU;
             `EXACT` where the file is as good as exact.
         log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
+        latest: what is known of all parameters, updated once a second; None before, and where they are not estimated.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, is_estimated: bool = True) -> None:
         assert rig.imu is not None
         self._rig = rig
         whole, n_cameras = file_prior(rig), n_of_cameras(rig)
@@ -49,17 +57,15 @@ class WindowCalibration:
             np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]), whole.group[self._rows]
         )
         self._whole = whole
+        self.size = len(self._rows) if is_estimated else 0
         self._evidence = self._kept = Evidence.none(len(self._rows))
         self._bias_walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
         self.factors = self._first_factors = self.exact_factors
         self.log_bayes_factor = 0.0
         self._files: dict[tuple[float, ...], Gaussian] = {}
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return len(self._rows)
+        self.latest: CalibrationEstimate | None = None
+        self._latest_ns = 0
 
     @property
     def exact_factors(self) -> Float:
@@ -78,15 +84,16 @@ class WindowCalibration:
     @property
     def candidates(self) -> list[Float]:
         """Factors (G,) with which a first window is tried."""
-        if not self.is_file_exact:
+        if not (self.is_file_exact and self.size):
             return [self.factors]
         return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]
 
-    def file(self, factors: Float) -> Gaussian | None:
+    def file(self, factors: Float | None = None) -> Gaussian | None:
         """Return what is known before an epoch: by a rig file that is wrong by some factors (G,), and earlier epochs.
 
-        None where the file is exact.
+        None where the file is exact. Without an argument, of the file as wrong as it is taken for now.
         """
+        factors = self.factors if factors is None else factors
         if self.is_exact(factors):
             return None
         key = tuple(factors.tolist())
@@ -128,8 +135,24 @@ class WindowCalibration:
 
     def forget(self) -> None:
         """Forget what ended epochs have shown: no motion fits it."""
-        self._kept = Evidence.none(self.size)
+        self._kept = Evidence.none(len(self._rows))
         self._files.clear()
+
+    def doubts_file(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
+        """Let the window say how wrong the rig file is, and return whether that is news.
+
+        Args:
+            measured: in the window.
+            adjusted: states and landmarks of the window.
+            prior: from before the window.
+        """
+        if not self.size:
+            return False
+        file, at = self.file(), adjusted.equations
+        if file is None:
+            file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
+            at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
+        return self.update(evidence_of(at, adjusted.states, file))
 
     def update(self, evidence: Evidence) -> bool:
         """Take what the window and what left it say of the calibration.
@@ -145,22 +168,27 @@ class WindowCalibration:
             self.factors = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
         return not np.array_equal(self.factors, before)
 
-    def estimate(self, difference: Float, biases: Float, bias_covariance: Float) -> CalibrationEstimate:
-        """Return what is known of all parameters.
+    def note(self, stamp_ns: int, states: States, covariance: StateCovariance) -> None:
+        """Keep what is known of all parameters, once a second.
 
         Args:
-            difference: (F,) that is in force.
-            biases: (6,) of the IMU.
-            bias_covariance: (6, 6).
+            stamp_ns: of the newest state.
+            states: with the difference that is in force.
+            covariance: of the newest state, and of the biases.
         """
+        if not self.size or stamp_ns - self._latest_ns < _ESTIMATE_EVERY_NS:
+            return
         own = self._evidence.given(self._prior, np.maximum(self.factors, _MIN_FACTOR))
+        of_biases = np.zeros((6, 6))
+        of_biases[:3, :3], of_biases[3:, 3:] = covariance.gyro_bias, covariance.accel_bias
         n = len(self._whole.covariance)
         mean, information, in_force = np.zeros(n), np.zeros((n, n)), np.zeros(n)
-        mean[self._rows], mean[self._biases] = own.mean, biases
+        mean[self._rows], mean[self._biases] = own.mean, states.biases
         information[np.ix_(self._rows, self._rows)] = own.information
-        information[np.ix_(self._biases, self._biases)] = np.linalg.inv(bias_covariance)
-        in_force[self._rows], in_force[self._biases] = difference, biases
-        return CalibrationEstimate(
+        information[np.ix_(self._biases, self._biases)] = np.linalg.inv(of_biases)
+        in_force[self._rows], in_force[self._biases] = states.calibration, states.biases
+        self._latest_ns = stamp_ns
+        self.latest = CalibrationEstimate(
             self._rig, Gaussian(mean, information), in_force, self.factors.copy(), self.log_bayes_factor
         )
 

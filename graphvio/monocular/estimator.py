@@ -28,8 +28,6 @@ from graphvio.monocular.adjustment import (
     Measurements,
     adjust,
     covariance_of,
-    equations,
-    evidence_of,
     views_only,
 )
 from graphvio.monocular.calibration import WindowCalibration, time_offset_s
@@ -47,11 +45,10 @@ from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
-from graphvio.monocular.states import Prior, States
+from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import Gaussian
 
 _FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
@@ -65,7 +62,6 @@ _MAX_CONTRADICTION_NS = 1_000_000_000
 _MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
 _REPORT_AFTER_NS = 5_000_000_000
-_CALIBRATION_EVERY_NS = 1_000_000_000
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
 _NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
 
@@ -86,16 +82,13 @@ class MonocularEstimator:
         self.gate_results: dict[str, GateResult] = {}
         self.initialisations = 0
         self._config = config
-        self._imu = rig.imu
         self._report = report
         self._cameras = Cameras.of(rig)
-        self._calibration = WindowCalibration(rig) if config.estimates_calibration else None
+        self._calibration = WindowCalibration(rig, config.estimates_calibration)
         self._samples = SampleBuffer(
             rig.imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6)
         )
         self._shift_ns = 0  # of samples' stamps, for what the time offset was corrected by
-        self._calibration_estimate: CalibrationEstimate | None = None
-        self._calibration_ns = 0
         self._has_imu = self._is_initialised = False
         self._sigma_px = _FIRST_SIGMA_PX
         self._initialiser = self._new_initialiser()
@@ -138,7 +131,7 @@ class MonocularEstimator:
     @property
     def calibration(self) -> CalibrationEstimate | None:
         """What is known of the calibration, updated once a second; None before the first pose, and where it is not."""
-        return self._calibration_estimate
+        return self._calibration.latest
 
     @property
     def latest_ns(self) -> int:
@@ -311,8 +304,7 @@ class MonocularEstimator:
     def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Begin with a window whose scale is known."""
         self._window, self._is_keyframe, self._before, self._first_pose_ns = window, True, None, stamp_ns
-        if self._calibration is not None:
-            self._calibration.begin(window.factors)
+        self._calibration.begin(window.factors)
         self.initialisations += 1
         self._report(
             stamp_ns,
@@ -326,10 +318,8 @@ class MonocularEstimator:
 
         Once the calibration is estimated, the window itself finds out how the cameras are turned to each other.
         """
-        is_estimated = self._calibration is not None and not (
-            self._calibration.is_file_exact and (window is None or self._calibration.is_exact(window.factors))
-        )
-        if not (self._has_overlaps and self._are_trusted) or is_estimated:
+        is_exact = self._calibration.is_file_exact and (window is None or self._calibration.is_exact(window.factors))
+        if not (self._has_overlaps and self._are_trusted and is_exact):
             return None
         states = None if window is None else window.states
         found = self._trust.add(stamp_ns, self._sightings, self._is_stationary, states)
@@ -346,15 +336,15 @@ class MonocularEstimator:
         if not is_new:
             window.views.append(window.names.join(self._sightings))
             window.stationary.append(self._is_stationary)
-        self._is_keyframe = is_keyframe
+        self._is_keyframe, calibration = is_keyframe, self._calibration
         cameras = window.states.cameras(self._cameras)
         structure, places, ids = window.landmarks.structure(window.views, window.states.poses, cameras)
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
-        adjusted = adjust(measured, window.states, places, window.prior, steps, self._file)
-        if is_keyframe and self._doubts_file(measured, adjusted, window.prior):
+        adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
+        if is_keyframe and calibration.doubts_file(measured, adjusted, window.prior):
             adjusted = adjust(
-                measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS, self._file
+                measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS, calibration.file()
             )
         window.states = adjusted.states
         self._samples.time_offset_s = time_offset_s(adjusted.states.calibration)
@@ -372,35 +362,10 @@ class MonocularEstimator:
         self._solved = Solved(adjusted, structure, ids, window.views[-1])
         self._set_covariance(adjusted)
         if is_keyframe:
-            self._note_calibration(stamp_ns, adjusted.states)
+            calibration.note(stamp_ns, adjusted.states, self.covariance)
             self._finish_keyframe(window, adjusted)
         status = self._status(stamp_ns, is_tracking, adjusted)
         return StateUpdate(status, outliers=dropped)
-
-    @property
-    def _file(self) -> Gaussian | None:
-        """What is known of the calibration before the epoch, None where the rig file is taken for exact."""
-        return None if self._calibration is None else self._calibration.file(self._calibration.factors)
-
-    def _doubts_file(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
-        """Let the window say how wrong the rig file is, and return whether that is news."""
-        if self._calibration is None:
-            return False
-        file, at = self._file, adjusted.equations
-        if file is None:
-            n = self._calibration.size
-            file = Gaussian(np.zeros(n), np.zeros((n, n)))
-            at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
-        return self._calibration.update(evidence_of(at, adjusted.states, file))
-
-    def _note_calibration(self, stamp_ns: int, states: States) -> None:
-        """Keep what is known of the calibration, once in a second."""
-        if self._calibration is None or stamp_ns - self._calibration_ns < _CALIBRATION_EVERY_NS:
-            return
-        of_biases = np.zeros((6, 6))
-        of_biases[:3, :3], of_biases[3:, 3:] = self.covariance.gyro_bias, self.covariance.accel_bias
-        self._calibration_ns = stamp_ns
-        self._calibration_estimate = self._calibration.estimate(states.calibration, states.biases, of_biases)
 
     def _leave_out_mismatches(self, window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
         """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
@@ -430,10 +395,7 @@ class MonocularEstimator:
         is_before = int(states.stamps_ns[0]) < self._first_pose_ns
         if not is_before:
             self._hand_over(measured.structure, states, places[leaving])
-        step_s = (states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9
-        walk = np.sqrt(step_s) * np.diag(np.repeat([self._imu.gyro_random_walk, self._imu.accel_random_walk], 3))
-        if self._calibration is not None:
-            walk = self._calibration.walk(step_s)
+        walk = self._calibration.walk((states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9)
         window.prior = without_first(measured, states, places[leaving], window.prior, walk)
         window.names.end(window.views[0].landmark)
         window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
@@ -455,7 +417,7 @@ class MonocularEstimator:
         )
 
     def _measured(self, window: Window, structure: Structure) -> Measurements:
-        samples = self._samples.between(window.states.stamps_ns, self._file is None)
+        samples = self._samples.between(window.states.stamps_ns, self._calibration.is_file_exact)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
 
     def _set_covariance(self, adjusted: Adjusted) -> None:
@@ -504,7 +466,7 @@ class MonocularEstimator:
         """
         if self._window is not None:
             self.finish()
-            if is_sound and self._calibration is not None:
+            if is_sound:
                 self._calibration.keep()
             self.epoch += 1
             self._report(stamp_ns, EventKind.LOST, why)

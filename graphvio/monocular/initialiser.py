@@ -48,7 +48,6 @@ _FIRST_DOUBT = 3  # windows that fit no motion with an exact file, until that is
 _OTHER_SCALES = (0.6, 1.7)
 _MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
 POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
-_NO_FACTORS = np.zeros(0)
 
 
 @dataclass(eq=False)
@@ -79,7 +78,7 @@ class Initialiser:
 
     Args:
         cameras: of the rig.
-        calibration: says how wrong the rig file may be; None where it is taken for exact.
+        calibration: says how wrong the rig file may be.
         samples_of: Returns the IMU's samples of some instants.
         sigma_px: noise of a corner's position.
         doubts_file: whether windows that fit no motion are tried with a rig file that is wrong.
@@ -88,7 +87,7 @@ class Initialiser:
     def __init__(
         self,
         cameras: Cameras,
-        calibration: WindowCalibration | None,
+        calibration: WindowCalibration,
         samples_of: Callable[[np.ndarray, bool], InertialSamples],
         sigma_px: float,
         doubts_file: bool = True,
@@ -141,8 +140,6 @@ class Initialiser:
 
     def _candidates(self) -> list[Float]:
         """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
-        if self._calibration is None:
-            return [_NO_FACTORS]
         self._contradicted += self._fits_no_motion
         if not (self._doubts_file and self._fits_no_motion) or self._contradicted < self._doubted_at:
             return self._calibration.candidates[:1]
@@ -153,7 +150,7 @@ class Initialiser:
     def _solved(self, factors: Float) -> Window | None:
         """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
         self._fits_no_motion = False
-        file = None if self._calibration is None else self._calibration.file(factors)
+        file = self._calibration.file(factors)
         keyframes = self._keyframes
         samples = self._samples_of(np.array([stamp for stamp, _, _ in keyframes]), file is None)
         if file is not None:  # where samples begin too late for some time offsets, these would be out of reach
@@ -173,9 +170,7 @@ class Initialiser:
             return None
         guess = first_guess(samples, structure, self._cameras, self._gyro_bias)
         biases = np.concatenate([guess.gyro_bias, np.zeros(3)])
-        calibration = np.zeros(0 if self._calibration is None else self._calibration.size)
-        if file is not None:
-            calibration = file.mean
+        calibration = np.zeros(self._calibration.size) if file is None else file.mean
         states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases, calibration)
         bias_sigmas = np.repeat([self._gyro_bias_sigma, ACCEL_BIAS_SIGMA], 3)
         prior = first_prior(states, bias_sigmas, np.concatenate([self._gyro_bias, np.zeros(3)]), POSE_SIGMAS)
@@ -201,7 +196,7 @@ class Initialiser:
             states = adjusted.states
             landmarks.put(adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
-            if file is not None and self._calibration is not None and fitting == 1.0:
+            if file is not None and fitting == 1.0:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
                 file = self._calibration.file(factors)
             fitting *= 1.0 - float(off.mean())
@@ -235,8 +230,7 @@ class Initialiser:
     def _is_plausible(self, states: States) -> bool:
         """Return whether calibration and biases are such as sensors have."""
         of_accel = np.abs(states.biases[3:]) <= _MAX_SIGMAS * ACCEL_BIAS_SIGMA
-        calibration = self._calibration
-        return bool(of_accel.all()) and (calibration is None or calibration.is_plausible(states.calibration))
+        return bool(of_accel.all()) and self._calibration.is_plausible(states.calibration)
 
     def _in_nav(self, window: Window) -> Window:
         """Turn a window level: its first pose has heading zero, and is the origin."""
