@@ -72,6 +72,16 @@ def test_alignment_errors_are_distances_of_second_camera() -> None:
     np.testing.assert_allclose(paper_method.alignment_errors(PoseParts.of(pairs), R, t), expected, atol=1e-12)
 
 
+def test_costs_of_triples_are_the_sums_of_limited_distances() -> None:
+    rng = np.random.default_rng(4)
+    weighted = paper_method._Weighted(synthetic_pairs(40, rng).pairs)
+    R = np.array([so3_exp(vector) for vector in rng.normal(size=(5, 3))])
+    R[0], t = LEFT2_T_LEFT1[:3, :3].T, rng.normal(size=(5, 3))
+    limit = float(np.median([weighted.distances(*each) for each in zip(R, t, strict=True)]))
+    expected = [np.minimum(weighted.distances(*each), limit).sum() for each in zip(R, t, strict=True)]
+    np.testing.assert_allclose(weighted.costs(R, t, limit), expected, rtol=1e-10)
+
+
 def test_jacobians_match_numerical_derivatives() -> None:
     parts = PoseParts.of(synthetic_pairs(10, np.random.default_rng(4), ANGLE, STEP_M).pairs)
     R, t, h = LEFT2_T_LEFT1[:3, :3], np.array([0.1, -0.2, 0.3]), 1e-6

@@ -579,7 +579,7 @@ def test_first_window_by_a_wrong_file_finds_a_time_offset_of_either_sign(
 
 
 def test_an_epoch_after_the_dark_begins_with_the_calibration_that_was_learnt() -> None:
-    """Without it, this one is off by more than 1.5 cm: its first window is as far from the truth as the file."""
+    """Without it, this one is off by 3 cm: its first window is as far from the truth as the file."""
     rig = overlapping_rig()
     _, written = wrong_by(rig, seed=0, level=3)
     strict = replace(Config(), smoother=replace(Config().smoother, lost_position_sigma_m=0.05))

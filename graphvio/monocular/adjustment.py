@@ -75,8 +75,8 @@ def equations(
         states: K of them.
         landmarks: (L, 3).
         prior: from before the window.
-        file: what the rig file says of the calibration, which is unknown then; None where the calibration is taken for
-            known.
+        file: what the rig file, and epochs before, say of the calibration, which is unknown then; None where the
+            calibration is taken for known.
     """
     n, n_cameras, n_free = len(states.poses), states.n_cameras, 0 if file is None else len(states.calibration)
     eliminated = Eliminated.empty(measured.structure, n_cameras if n_free else 0)
@@ -168,7 +168,7 @@ def evidence_of(at: Equations, states: States, file: Gaussian) -> Evidence:
     Args:
         at: equations at the states.
         states: adjusted.
-        file: what the rig file says, which is in the equations, and not in the evidence.
+        file: what the rig file, and epochs before, say: it is in the equations, and not in the evidence.
     """
     hessian, n_free = at.hessian.copy(), len(file.mean)
     known = len(hessian) - n_free

@@ -154,8 +154,8 @@ class Initialiser:
         keyframes = self._keyframes
         samples = self._samples_of(np.array([stamp for stamp, _, _ in keyframes]), file is None)
         if file is not None:  # where samples begin too late for some time offsets, these would be out of reach
-            since_ns = samples.stamps_ns[:1] + MAX_TIME_OFFSET_NS
-            keyframes = [keyframe for keyframe in keyframes if (keyframe[0] >= since_ns).all()]
+            since_ns = samples.stamps_ns[0] + MAX_TIME_OFFSET_NS
+            keyframes = [keyframe for keyframe in keyframes if keyframe[0] >= since_ns]
         stamps = np.array([stamp for stamp, _, _ in keyframes])
         samples = samples._replace(keyframes_ns=stamps)
         names, landmarks = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1), Landmarks()
@@ -177,7 +177,7 @@ class Initialiser:
         stationary = np.flatnonzero([still for _, _, still in keyframes])
         landmarks = Landmarks()
         fitting = 1.0
-        for _ in range(2):
+        for is_first in (True, False):
             cameras = states.cameras(self._cameras)
             structure, places, ids = landmarks.structure(views, states.poses, cameras)
             if len(ids) < _MIN_LANDMARKS:
@@ -186,7 +186,7 @@ class Initialiser:
                 return None
             places = located(states.poses, cameras, places, structure, self._sigma_px, True)
             measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
-            if file is not None and fitting == 1.0:
+            if file is not None and is_first:
                 # By the rig file, points are off by pixels: they are not distinguished from mismatches yet.
                 rough = adjust(
                     measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file
@@ -196,7 +196,7 @@ class Initialiser:
             states = adjusted.states
             landmarks.put(adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
-            if file is not None and fitting == 1.0:
+            if file is not None and is_first:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
                 file = self._calibration.file(factors)
             fitting *= 1.0 - float(off.mean())

@@ -20,7 +20,7 @@ from graphvio.frontend.images import ImageMask
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
-from graphvio.measurements.events import Event, Report
+from graphvio.measurements.events import Event
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
@@ -76,21 +76,6 @@ def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | Filte
     return FilterEstimator if config.fusion.estimator == "filter" else SmootherEstimator
 
 
-def _calibration_of(
-    rig: Rig,
-    config: Config,
-    frontend: VisualFrontend,
-    synchroniser: Synchroniser,
-    estimator: StateEstimator,
-    report: Report,
-) -> OnlineCalibration:
-    if not config.estimates_calibration:
-        return FixedCalibration()
-    if isinstance(estimator, MonocularEstimator):
-        return SinglesCalibration(rig, frontend, synchroniser, estimator, report)
-    return PairsCalibration(rig, config, frontend, synchroniser, estimator, report)
-
-
 class Odometry:
     """Visual-inertial odometry of a rig of stereo pairs and single cameras.
 
@@ -126,9 +111,7 @@ class Odometry:
         self._imu = ImuOfFramesets(rig, self.config, self._synchroniser, self._estimator, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
-        self._calibration = _calibration_of(
-            rig, self.config, self._frontend, self._synchroniser, self._estimator, self.report
-        )
+        self._calibration = self._new_calibration()
         self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
         self._rates = AngularRates()
@@ -138,6 +121,14 @@ class Odometry:
         self._events: deque[Event] = deque()  # appended to by any thread
         self._keyframe_ns: int | None = None  # stamp of the newest frameset that motions are measured from
         self._finished = False
+
+    def _new_calibration(self) -> OnlineCalibration:
+        rig, estimator = self.rig, self._estimator
+        if not self.config.estimates_calibration:
+            return FixedCalibration()
+        if isinstance(estimator, MonocularEstimator):
+            return SinglesCalibration(rig, self._frontend, self._synchroniser, estimator, self.report)
+        return PairsCalibration(rig, self.config, self._frontend, self._synchroniser, estimator, self.report)
 
     # ------------------------------------------------------------------ measurements in, estimates out
 
