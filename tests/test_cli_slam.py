@@ -20,7 +20,6 @@ from command_line import graphvio
 from ros2_loopback import URI, free_domain
 
 from graphvio import load_trajectory, open_source
-from graphvio.geometry import se3_inverse
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("grpc")
@@ -40,7 +39,7 @@ def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("slam") / "map"
     web = free_options()
     shown = ("--save-rrd", out.parent / "shown.rrd", "--web", web.port)
-    done = slam(f"replay:{room_walk}?speed=1", "--out", out, *shown, "--health-port", 0, "--ros2", free_domain())
+    done = slam(f"replay:{room_walk}?speed=0.5", "--out", out, *shown, "--health-port", 0, "--ros2", free_domain())
     assert done.returncode == 0, done.stderr
     assert f"browser: {web.url}" in done.stderr.splitlines()
     assert "health: http://127.0.0.1:" in done.stderr
@@ -60,19 +59,20 @@ def test_slam_makes_a_map_with_the_odometrys_path(made: Path, room_walk: Path) -
 
 
 def test_slam_localises_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Path) -> None:
-    """From the middle of the walk, where the new odom frame has nothing to do with the map's."""
-    done = slam(f"{room_walk}?from_s=1.5&speed=0.6", "--map", made, "--out", tmp_path / "again")
+    """From the middle of the walk, where the new odom frame has nothing to do with the map's.
+
+    The places of the session, which the SLAM corrects until it has processed the last, are where the map has them.
+    How soon the first correction comes, and so the path online, is a matter of the machine's load.
+    """
+    done = slam(f"{room_walk}?from_s=2.5&speed=0.4", "--map", made, "--out", tmp_path / "again")
     assert done.returncode == 0, done.stderr
-    online = load_trajectory(tmp_path / "again/online.txt")
-    before, known = load_trajectory(made / "odometry.txt").at(online.stamps_ns, 0.1)
-    apart = [
-        se3_inverse(np.ascontiguousarray(a)) @ b
-        for a, b in zip(before.nav_T_body, online.select(known).nav_T_body, strict=True)
-    ]
-    assert len(apart) >= 3
-    assert np.median([np.linalg.norm(each[:3, 3]) for each in apart]) < 0.05
-    start = load_trajectory(tmp_path / "again/odometry.txt").positions[0]
-    assert np.linalg.norm(online.positions[0] - start) > 0.2
+    corrected, odometry = (load_trajectory(tmp_path / f"again/{name}.txt") for name in ("trajectory", "odometry"))
+    expected, known = load_trajectory(made / "odometry.txt").at(corrected.stamps_ns, 0.1)
+    apart = expected.positions - corrected.select(known).positions
+    assert len(apart) >= 3, done.stderr
+    assert np.median(np.linalg.norm(apart, axis=1)) < 0.05, done.stderr
+    in_odom, known = odometry.at(corrected.stamps_ns, 0.1)
+    assert np.linalg.norm(corrected.select(known).positions - in_odom.positions, axis=1).min() > 0.2
 
 
 def test_slam_missing_map_is_refused_before_the_source_opens(tmp_path: Path) -> None:
