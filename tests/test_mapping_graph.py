@@ -29,24 +29,34 @@ def circle(laps: float, count: int) -> Float:
     return np.array(made)
 
 
-def walked(graph: PoseGraph, truth: Float, rng: np.random.Generator, origin: Float | None = None) -> None:
+def walked(
+    graph: PoseGraph,
+    truth: Float,
+    rng: np.random.Generator,
+    origin: Float | None = None,
+    sigmas: Float = STEP_SIGMAS,
+) -> None:
     """Add a fragment with random drift; its odom frame is the world, or at the origin (4, 4)."""
     world_T_odom = np.eye(4) if origin is None else origin
     graph.begin(se3_inverse(world_T_odom) @ truth[0])
     for one, other in pairwise(truth):
-        motion = se3_inverse(one) @ other @ se3_exp(STEP_SIGMAS * rng.standard_normal(6))
-        graph.add(motion, np.diag(STEP_SIGMAS**2))
+        motion = se3_inverse(one) @ other @ se3_exp(sigmas * rng.standard_normal(6))
+        graph.add(motion, np.diag(sigmas**2))
 
 
 def closure(
-    truth: Float, one: int, other: int, rng: np.random.Generator, wrong: Float | None = None, inliers: int = 200
+    truth: Float,
+    one: int,
+    other: int,
+    rng: np.random.Generator,
+    wrong: Float | None = None,
+    inliers: int = 200,
+    sigmas: Float = LOOP_SIGMAS,
 ) -> LoopClosure:
-    motion = se3_inverse(truth[one]) @ truth[other] @ se3_exp(LOOP_SIGMAS * rng.standard_normal(6))
+    motion = se3_inverse(truth[one]) @ truth[other] @ se3_exp(sigmas * rng.standard_normal(6))
     if wrong is not None:
         motion = motion @ se3_exp(wrong)
-    return LoopClosure(
-        Place(0, one, one), Place(0, other, other), motion, np.diag(LOOP_SIGMAS**2), inliers, ((0, 0),), True
-    )
+    return LoopClosure(Place(0, one, one), Place(0, other, other), motion, np.diag(sigmas**2), inliers, ((0, 0),), True)
 
 
 def worst_m(graph: PoseGraph, truth: Float) -> float:
@@ -147,6 +157,24 @@ def test_fragment_is_joined_by_three_places_that_agree() -> None:
     assert used[5, 45]
     error = se3_log(se3_inverse(graph.pose(50)) @ truth[50])
     assert error @ np.linalg.solve(graph.covariance(50), error) < 25.0
+
+
+@pytest.mark.parametrize("off_m", [0.3, 1.0, 1.9])
+def test_closure_far_off_does_not_keep_a_fragment_apart(off_m: float) -> None:
+    """One that the vague joint of the fragments does not refute, between chains that are hardly to be bent."""
+    truth, rng, steps, loops = circle(1.2, 48), np.random.default_rng(10), 0.05 * STEP_SIGMAS, 0.3 * LOOP_SIGMAS
+    graph = PoseGraph(PROBABILITY)
+    walked(graph, truth[:7], rng, sigmas=steps)
+    walked(graph, truth[40:46], rng, origin=truth[40], sigmas=steps)
+    truth = np.concatenate([truth[:7], truth[40:46]])
+    off = np.array([0.0, 0.0, 0.0, off_m, 0.0, 0.0])
+    graph.add_closures([closure(truth, 0, 9, rng, off, inliers=60, sigmas=loops)])
+    for k in range(8, 13):
+        graph.add_closures([closure(truth, k - step, k, rng, sigmas=loops) for step in (6, 7)])
+    assert graph.is_in_map(12)
+    used = {(each.edge.first, each.edge.second): each.is_used for each in graph.closures}
+    assert not used.pop((0, 9))
+    assert all(used.values())
 
 
 def test_joined_fragment_uses_single_closures() -> None:

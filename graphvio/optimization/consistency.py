@@ -149,6 +149,8 @@ def consistent(
     params = gtsam.GncLMParams()
     params.setKnownInliers(known)
     params.setLossType(gtsam.GncLossType.TLS)
+    # Until all weights are 0 or 1: the first weights of all closures are below any tolerance if one of them is far off.
+    params.setWeightsTol(0.0)
     optimizer = gtsam.GncLMOptimizer(graph, values, params)
     optimizer.setInlierCostThresholdsAtProbability(probability)
     solution = optimizer.optimize()
