@@ -1,4 +1,4 @@
-"""Motion of a pair and a single camera whose points have no depth yet, by Monte Carlo.
+"""Motion of a pair and a single camera whose points have no depth yet, or depths of a wrong scale, by Monte Carlo.
 
 Images have less noise than the configuration says, as on most recordings. Bands of the mean are those of cautious
 covariances: an overconfident one is what the odometry cannot recover from.
@@ -34,8 +34,11 @@ def seen(points: Float, cam_T_points: Float, noise_px: float, focal_px: float, r
     return np.asarray(there[:, :2] / there[:, 2:] + noise_px / focal_px * rng.standard_normal((len(points), 2)))
 
 
-def observed(cur_T_ref: Float, rng: np.random.Generator) -> Observations:
-    """Points of both, 1 to 6 m away, at two instants."""
+def observed(cur_T_ref: Float, rng: np.random.Generator, scale: float | None = None) -> Observations:
+    """Points of both, 1 to 6 m away, at two instants.
+
+    The single camera's inverse depths are known to 1 %, but for a common scale; or not at all without a scale.
+    """
     parts = []
     for j, camera in enumerate((PAIR.left, SINGLE)):
         depths = rng.uniform(1.0, 6.0, N)
@@ -50,9 +53,12 @@ def observed(cur_T_ref: Float, rng: np.random.Generator) -> Observations:
             right = seen(points, PAIR.right_T_left @ moved, noise_px, focal_px, rng)
             located, covariances, _ = triangulate(then, right_then, PAIR.right_T_left, focal_px, PAIR.right.focal_px)
         else:
-            located = np.column_stack([then, np.full(N, PRIOR_INVERSE_DEPTH)])
-            variances = [focal_px**-2, focal_px**-2, (PRIOR_SIGMA / CONFIG.pixel_sigma_px) ** 2]
-            covariances = np.tile(np.diag(variances), (N, 1, 1))
+            inverse, sigma = np.full(N, PRIOR_INVERSE_DEPTH), np.full(N, PRIOR_SIGMA)
+            if scale is not None:
+                inverse, sigma = scale / depths * rng.normal(1.0, 0.01, N), 0.01 / depths
+            located = np.column_stack([then, inverse])
+            covariances = np.tile(focal_px**-2 * np.eye(3), (N, 1, 1))
+            covariances[:, 2, 2] = (sigma / CONFIG.pixel_sigma_px) ** 2
         parts.append(Observations(np.full(N, j), located, covariances, now, right, np.full(N, j == 0)))
     return Observations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -74,3 +80,23 @@ def test_motion_with_vague_depths_is_as_wrong_as_its_covariance_says(name: str) 
         sizes.append(np.linalg.det(found.covariance) / np.linalg.det(alone.covariance))
     assert 0.4 < np.mean(values) < 1.2
     assert np.median(sizes) < 1.0
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.001, 0.004])
+def test_scale_of_a_single_cameras_depths_does_not_scale_the_motion(sigma: float) -> None:
+    """The pair knows how long the step is; how the rig turned and where it went, both know better than the pair."""
+    motion, arrays = se3(so3_exp(np.array([0.01, -0.02, 0.005])), np.array([0.12, -0.03, 0.02])), RigArrays.of(RIG)
+    values: list[float] = []
+    lengths, turned = np.empty((2, DRAWS)), np.empty((2, DRAWS))  # of both, and of the pair alone
+    for seed in range(DRAWS):
+        rng = np.random.default_rng([1, seed])
+        observations = observed(motion, rng, scale=float(np.exp(sigma * rng.standard_normal())))
+        found, _ = joint_motion_with_vague_depths(arrays, observations, np.eye(4), CONFIG, rng)
+        alone = joint_motion(arrays, observations.of_pair(0), np.eye(4), CONFIG, rng)
+        values.append(nees(found, motion))
+        for k, each in enumerate((found, alone)):
+            lengths[k, seed] = np.linalg.norm(each.cur_T_ref[:3, 3])
+            turned[k, seed] = np.linalg.norm(se3_log(each.cur_T_ref @ se3_inverse(motion))[:3])
+    assert 0.3 < np.mean(values) < 1.2
+    assert np.std(lengths[0]) < 1.1 * np.std(lengths[1])
+    assert np.median(turned[0]) < 0.7 * np.median(turned[1])

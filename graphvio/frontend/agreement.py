@@ -15,6 +15,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.alignment import combined, placed
+from graphvio.frontend.depth_scale import with_scale_of_depths, with_unknown_scales
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
@@ -178,7 +179,8 @@ def _own_motion_of_single(
     known = seen.has_known_depth(config.pixel_sigma_px)
     if not known.any():
         return replace(joint, inlier=np.zeros(len(known), dtype=bool), errors_px=np.full(len(known), np.nan))
-    return _spread_over(known, refine(rig, seen.of_rows(known), joint.cur_T_ref, config))
+    refined = refine(rig, seen.of_rows(known), joint.cur_T_ref, config)
+    return _spread_over(known, with_scale_of_depths(rig, int(seen.pair[0]), refined))
 
 
 def _hypothesis(
@@ -195,7 +197,8 @@ def _hypothesis(
     refined = placed_motions[pairs[0]]
     if len(pairs) > 1:
         first = own[max(pairs, key=lambda j: int(own[j].inlier.sum()))]
-        refined = refine(rig, observations.of_rows(rows), first.cur_T_ref, config)
+        seen = observations.of_rows(rows)
+        refined = with_unknown_scales(rig, seen, refine(rig, seen, first.cur_T_ref, config), config)
         if not uncertain.keys().isdisjoint(pairs):
             refined = combined(refined, [placed_motions[j] for j in pairs])
     return MotionHypothesis(tuple(pairs), _spread_over(rows, refined))

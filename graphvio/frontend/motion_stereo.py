@@ -5,8 +5,8 @@ its first sight and of the newest one, for the motion that all cameras measured 
 baseline a wide prior stands for the depth: such a point constrains the motion by its epipolar line only, as its
 covariance says.
 
-The motion's error is common to all points. A covariance for each point cannot say so, and N points would seem to know
-the motion N times better than it is known: its covariance counts N-fold in each of them.
+The motion's error is common to all points, which a covariance for each of them cannot say: an unknown common scale
+takes its place where a motion is estimated by these points, see `graphvio.frontend.depth_scale`.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class FirstSights:
         adjoint = se3_adjoint(cam_T_body)
         known = [each for each in since if each is not None]  # all of them, by `_of_tracks`
         then_T_now = np.array([cam_T_body @ se3_inverse(each.cur_T_then) @ body_T_cam for each in known])
-        motion = np.array([adjoint @ each.covariance @ adjoint.T for each in known]) * (len(ids) / sigma_px**2)
+        motion = np.array([adjoint @ each.covariance @ adjoint.T for each in known]) / sigma_px**2
         drift = np.array([_DRIFT_PX2 * each.keyframes for each in known])
         points, covariances, fits = _locate(
             rays, first, which, then_T_now.reshape(-1, 4, 4), motion.reshape(-1, 6, 6), drift, 1.0 / focal_px**2,

@@ -7,6 +7,7 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
+from graphvio.frontend.depth_scale import with_unknown_scales
 from graphvio.frontend.observations import Observations, RigArrays, is_depth_known
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, explained, refine
@@ -38,19 +39,22 @@ def joint_motion_with_vague_depths(
 
     The flow of such a point is any that the translation can explain. Where the translation is about zero, its error
     decides, and the minimum would lie where the noise of these points is explained best. So the motion is estimated
-    by the other points first, and what is not known of its translation counts as noise of their rays.
+    by the other points first, and what is not known of its translation counts as noise of their rays. The scale of
+    these cameras' depths is unknown in any case (`graphvio.frontend.depth_scale`).
 
     Returns:
         The motion on all points, and the observations with that noise.
     """
     known = is_depth_known(rig, observations, config.pixel_sigma_px)
     if known.all() or known.sum() < config.min_inliers:
-        return joint_motion(rig, observations, predicted, config, rng), observations
+        refined = joint_motion(rig, observations, predicted, config, rng)
+        return with_unknown_scales(rig, observations, refined, config), observations
     first = joint_motion(rig, observations.of_rows(known), predicted, config, rng)
     covariances, pair = observations.covariances.copy(), observations.pair[~known]
     covariances[~known] = _with_noise_of_motion(covariances[~known], pair, rig, first, config.pixel_sigma_px)
     observations = observations._replace(covariances=covariances)
-    return refine(rig, observations, first.cur_T_ref, config), observations
+    refined = refine(rig, observations, first.cur_T_ref, config)
+    return with_unknown_scales(rig, observations, refined, config), observations
 
 
 def _with_noise_of_motion(covariances: Float, pair: Int, rig: RigArrays, first: Refined, sigma_px: float) -> Float:

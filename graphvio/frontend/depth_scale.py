@@ -1,0 +1,99 @@
+"""Common scale of a single camera's depths, which no motion that is measured by them shows.
+
+Depths from motion are as wrong as the length of the motions that they were computed from, all of a camera together.
+Taken for independent errors of its points, they would let yesterday's length of a step decide on today's: small biases
+of the tracks add up to a scale that pairs know better. So the scale of each single camera's depths is one more unknown.
+
+A factor ``1 + s`` of all inverse depths of a camera changes what it sees as a translation of the camera that is longer
+by that factor does: the derivative by s is that by the motion, along the direction d of the camera's translation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.config.stages import MotionConfig
+from graphvio.frontend.blocks import POINTS, in_blocks, lane_by_lane
+from graphvio.frontend.cost import left_motions
+from graphvio.frontend.linearisation import expand, linearise, unexpanded
+from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.refinement import Refined
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
+from graphvio.kernels import kernel
+
+_SIGMA = 0.01  # of a common scale, relative: a step is known better by one good pair, and worse by the IMU alone
+_WEAKEST_SIGMA = 10.0  # rad and m, of directions that no point constrains
+
+
+def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Refined, config: MotionConfig) -> Refined:
+    """Correct a motion that took single cameras' depths for right but for independent errors.
+
+    Args:
+        rig: P pairs and single cameras.
+        observations: N points of any subset of them.
+        refined: The minimum for scales of 1.
+        config: Configuration of the motion stage.
+    """
+    singles = [j for j in observations.pairs if rig.is_single[j]]
+    if not singles:
+        return refined
+    n = 6 + len(singles)
+    information, right_hand_side = np.zeros((n, n)), np.zeros(n)
+    settings = config.pixel_sigma_px, config.cauchy_scale_px / config.pixel_sigma_px
+    information[:6, :6], _ = _normal_equations(refined.cur_T_ref, rig, observations, refined.inlier, *settings)
+    information[:6, :6] += _WEAKEST_SIGMA**-2 * np.eye(6)
+    for k, j in enumerate(singles, start=6):
+        of_camera = observations.of_pair(j)
+        hessian, gradient = _normal_equations(
+            refined.cur_T_ref, rig, of_camera, refined.inlier[observations.pair == j], *settings
+        )
+        along = _along_translation(rig, j, refined.cur_T_ref)
+        information[:6, k] = information[k, :6] = hessian @ along
+        information[k, k] = along @ hessian @ along + _SIGMA**-2
+        right_hand_side[k] = along @ gradient
+    covariance = np.linalg.inv(information)
+    known = np.linalg.inv(information[:6, :6])
+    noise = float(np.trace(refined.covariance @ information[:6, :6])) / 6.0  # over the modelled one
+    gained = noise * (covariance[:6, :6] - known)
+    step = covariance[:6] @ right_hand_side
+    return replace(
+        refined,
+        cur_T_ref=se3_exp(step) @ refined.cur_T_ref,
+        covariance=refined.covariance + gained,
+        shared_covariance=refined.shared_covariance + gained,
+    )
+
+
+def with_scale_of_depths(rig: RigArrays, single: int, motion: Refined) -> Refined:
+    """Enlarge the covariance of a single camera's own motion by what is not known of its depths' scale."""
+    along = _SIGMA * _along_translation(rig, single, motion.cur_T_ref)
+    of_scale = np.outer(along, along)
+    return replace(
+        motion,
+        covariance=motion.covariance + of_scale,
+        shared_covariance=motion.shared_covariance + of_scale,
+    )
+
+
+def _along_translation(rig: RigArrays, single: int, cur_T_ref: Float) -> Float:
+    """Return the derivative (6,) of the motion of body by a factor of a camera's translation."""
+    body_T_cam = np.ascontiguousarray(rig.body_T_left[single])
+    translation = (se3_inverse(body_T_cam) @ cur_T_ref @ body_T_cam)[:3, 3]
+    return np.asarray(se3_adjoint(body_T_cam)[:, 3:] @ translation)
+
+
+@kernel
+def _normal_equations(
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, inlier: Bool, sigma_px: float, scale: float
+) -> tuple[Float, Float]:
+    """Return the information (6, 6) and gradient (6,) of the inliers of N points at a motion."""
+    blocks, motions = in_blocks(observations), left_motions(cur_T_ref, rig)
+    at = unexpanded(blocks)
+    expand(motions, rig, blocks, np.full(len(rig.focal_px), sigma_px), at)
+    hessian, gradient = np.empty((6, 6)), np.empty(6)
+    active = lane_by_lane(blocks, inlier.astype(np.float64))
+    linearise(motions, rig, blocks, at, active, scale, hessian, gradient, np.empty((len(blocks.pair), POINTS)))
+    return hessian, gradient
