@@ -102,6 +102,15 @@ def test_saved_map_is_complete(made: Made) -> None:
     assert {path.name for path in made.folder.parent.iterdir()} == {"room"}  # nothing unfinished is left
 
 
+def test_session_is_located_in_a_map_of_few_places(tmp_path: Path) -> None:
+    """There were too few for a vocabulary while it was made."""
+    few = mapped(front_end(0, 30, seed=1)[0], save=tmp_path / "few")
+    assert count(few, "places") < 6
+    again = mapped(front_end(2, 26, seed=2, session=1)[0], tmp_path / "few")
+    assert count(again, "places_in_map_frame") == count(few, "places") + count(again, "places")
+    assert count(again, "closures_used") >= 3
+
+
 @pytest.mark.parametrize("first", [40, 112])
 def test_another_session_is_located_in_the_map(made: Made, tmp_path: Path, first: int) -> None:
     """From two places of the map; a third session would find both."""

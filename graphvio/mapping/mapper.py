@@ -88,6 +88,8 @@ class Mapper:
         self._tried = 0
         self._sent = 0
         self._refused: list[str] = []
+        if self._first and not self._recognition.words.size:  # a map of too few places for a vocabulary, until now
+            self._recognition.learn(self._descriptors)
 
     def __enter__(self) -> Mapper:
         return self
