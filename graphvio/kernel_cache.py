@@ -16,7 +16,8 @@ from importlib import metadata
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
-_IMPORT = re.compile(r"^from (graphvio[\w.]*) import", re.MULTILINE)
+_IMPORT = re.compile(r"^from (graphvio[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+_NAME = re.compile(r"\w+")
 
 
 @functools.cache
@@ -77,13 +78,29 @@ def source_digest(module: str) -> str:
     pending = [module]
     while pending:
         name = pending.pop()
-        if name in sources:
-            continue
-        path = _PACKAGE.parent.joinpath(*name.split("."))
-        file = path.with_suffix(".py") if not path.is_dir() else path / "__init__.py"
-        sources[name] = file.read_bytes() if file.is_file() else b""
-        pending += _IMPORT.findall(sources[name].decode())
+        if name not in sources:
+            sources[name], imported = _source(name)
+            pending += imported
     digest = hashlib.sha256(f"{metadata.version('numba')} {sys.version}".encode())
     for name in sorted(sources):
         digest.update(name.encode() + sources[name])
     return f"{module}-{digest.hexdigest()[:16]}"
+
+
+@functools.cache
+def _source(module: str) -> tuple[bytes, list[str]]:
+    """Return the digest of one module's source, and the modules of this package that it imports."""
+    path = _PACKAGE.parent.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    source = file.read_bytes() if file.is_file() else b""
+    imported = []
+    for package, names in _IMPORT.findall(source.decode()):
+        imported.append(package)
+        folder = _PACKAGE.parent.joinpath(*package.split("."))
+        if folder.is_dir():
+            imported += [f"{package}.{name}" for name in _NAME.findall(names) if _is_module(folder / name)]
+    return hashlib.sha256(source).digest(), imported
+
+
+def _is_module(path: Path) -> bool:
+    return path.is_dir() or path.with_suffix(".py").is_file()
