@@ -5,6 +5,8 @@ program that embeds graphvio makes those that suit it:
 
 - `set_up_threads`, since pairs are tracked in threads of their own, with which OpenCV's would compete, and which would
   wait for each other for milliseconds;
+- `limit_blas_threads` before numpy is imported, since BLAS would start threads of its own for matrices of some hundred
+  rows;
 - `share_heap` before threads are started, where images pass through many threads for hours;
 - `interruptible` around calls that Ctrl-C should end, even while compiled code runs;
 - `StopSignals`, `HeldInterrupt`, `on_interrupt` and the functions below them, for loops that must end cleanly.
@@ -16,6 +18,7 @@ Compiled kernels are cached in the folder that the environment variable ``GRAPHV
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import sys
 import threading
@@ -42,6 +45,15 @@ def set_up_threads() -> None:
 
     cv2.setNumThreads(1)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
+
+
+def limit_blas_threads() -> None:
+    """Let BLAS compute in the thread that calls it, in this process and those that it starts; before numpy is imported.
+
+    OpenBLAS has a thread for each core, and those that have nothing to do wait in a loop for the others: they take the
+    cores from the odometry. A number that the environment has in ``OPENBLAS_NUM_THREADS`` stays.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def share_heap() -> bool:

@@ -27,7 +27,7 @@ from graphvio.cli.slam import slam
 from graphvio.cli.view import view
 from graphvio.cli.warmup import warmup
 from graphvio.errors import GraphvioError
-from graphvio.runtime import interruptible
+from graphvio.runtime import interruptible, limit_blas_threads
 from graphvio.version import __version__
 
 app = typer.Typer(
@@ -86,6 +86,7 @@ _add(with_json(warmup))
 
 def main() -> None:
     """Run the program: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
+    limit_blas_threads()  # no module of the command line has imported numpy by now
     try:
         with interruptible():
             code = app(prog_name="graphvio", standalone_mode=False)
