@@ -65,6 +65,7 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
     if not _are_compiled(config):
         _compile_in_parallel(rig, config)
     _warm_up_tracking(rig, config)
+    _warm_up_imu(rig.imu or Imu())
     _warm_up_motion(rig, config)
     if not rig.pairs:
         adjust_no_keyframes(rig)
@@ -89,7 +90,7 @@ def _are_compiled(config: Config) -> bool:
 
 
 def _compile_in_parallel(rig: Rig, config: Config) -> None:
-    """Compile the kernels of tracking here and the others in a second process; only one program does so at a time.
+    """Compile the kernels of tracking and IMU here, the others in a second process; only one program does so at a time.
 
     It returns once a motion can be estimated. The second process holds the lock until it has finished.
     """
@@ -108,6 +109,7 @@ def _compile_in_parallel(rig: Rig, config: Config) -> None:
         except BrokenPipeError:
             return  # it does not find graphvio, for instance: everything is compiled here
         _warm_up_tracking(rig, config)
+        _warm_up_imu(rig.imu or Imu())
         other.stdout.read(len(_MOTION_IS_COMPILED))
 
 
@@ -159,8 +161,7 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
 
 
 def _warm_up_motion(rig: Rig, config: Config) -> None:
-    """Call the kernels that estimate a motion, by vision and by the IMU."""
-    _warm_up_imu(rig.imu or Imu())
+    """Call the kernels that estimate a motion from points."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])
     observations = Observations(

@@ -24,7 +24,7 @@ from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 from graphvio.kernels import kernel
 
-_SIGMA = 0.01  # of a common scale, relative: a step is known better by one good pair, and worse by the IMU alone
+_SIGMA = 0.01  # of a common scale, relative: wide next to what a good pair knows of a step, narrow next to the IMU
 _WEAKEST_SIGMA = 10.0  # rad and m, of directions that no point constrains
 
 
