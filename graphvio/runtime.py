@@ -48,7 +48,7 @@ def set_up_threads() -> None:
 
 
 def limit_blas_threads() -> None:
-    """Let BLAS compute in the thread that calls it, in this process and those that it starts; before numpy is imported.
+    """Let BLAS compute in the thread that calls it, in this process and its children; before numpy is imported.
 
     OpenBLAS has a thread for each core, and those that have nothing to do wait in a loop for the others: they take the
     cores from the odometry. A number that the environment has in ``OPENBLAS_NUM_THREADS`` stays.
