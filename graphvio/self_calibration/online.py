@@ -50,13 +50,14 @@ class _Pace(NamedTuple):
 
     adjusted_at: tuple[int, ...]  # keyframes
     interval_s: float  # at least, between keyframes
+    delay_framesets: int  # until a result comes into force
 
 
 _PACES = (
-    _Pace((1, 3, 6, 10, WINDOW), 0.1),
-    _Pace((5, 10, WINDOW), 0.1),
-    _Pace((5, 10, WINDOW), 0.15),
-    _Pace((8, WINDOW), 0.25),
+    _Pace((1, 3, 6, 10, WINDOW), 0.1, 2),
+    _Pace((5, 10, WINDOW), 0.1, 4),
+    _Pace((5, 10, WINDOW), 0.15, 4),
+    _Pace((8, WINDOW), 0.25, 8),
 )
 """Of the first windows; the last one is that of all later ones."""
 
@@ -258,7 +259,7 @@ class SelfCalibration:
         if len(self._collector.keyframes) < min(size for size in self._pace.adjusted_at if size > self._adjusted_at):
             return
         window = tuple(self._collector.keyframes)
-        self._due_in = _delay_framesets(len(window))
+        self._due_in = self._pace.delay_framesets
         self._adjusted_at = len(window)
         if is_full := len(window) >= WINDOW:
             self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
@@ -325,11 +326,6 @@ def adjust_nothing(rig: Rig) -> None:
     information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
     solve_lower(cholesky(information), right)
     solve_rows(information, right)
-
-
-def _delay_framesets(n_keyframes: int) -> int:
-    """Return after how many framesets an adjustment comes into force: so many that it has ended, and nothing waits."""
-    return 2 + n_keyframes // 4
 
 
 def _assumed(factors: Float) -> Float:
