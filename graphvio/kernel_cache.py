@@ -90,17 +90,18 @@ def source_digest(module: str) -> str:
 @functools.cache
 def _source(module: str) -> tuple[bytes, list[str]]:
     """Return the digest of one module's source, and the modules of this package that it imports."""
-    path = _PACKAGE.parent.joinpath(*module.split("."))
-    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    file = _file(module)
     source = file.read_bytes() if file.is_file() else b""
     imported = []
     for package, names in _IMPORT.findall(source.decode()):
         imported.append(package)
-        folder = _PACKAGE.parent.joinpath(*package.split("."))
-        if folder.is_dir():
-            imported += [f"{package}.{name}" for name in _NAME.findall(names) if _is_module(folder / name)]
+        if _file(package).name == "__init__.py":  # what is imported from it may be modules
+            named = [f"{package}.{name}" for name in _NAME.findall(names)]
+            imported += [each for each in named if _file(each).is_file()]
     return hashlib.sha256(source).digest(), imported
 
 
-def _is_module(path: Path) -> bool:
-    return path.is_dir() or path.with_suffix(".py").is_file()
+def _file(module: str) -> Path:
+    """Return where the source of a module or package is, if there is one."""
+    path = _PACKAGE.parent.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
