@@ -32,6 +32,7 @@ from graphvio.optimization.optimize import optimize
 from graphvio.optimization.pipeline import DATABASE, Session, Stages, optimize_sessions
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.rig_files import load_rig, save_rig
+from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
@@ -211,7 +212,7 @@ def test_optimize_killed_run_continues_to_equal_results(walk: Path, settings: Pa
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     finished = json.loads((out / "stages.json").read_text())["finished"]
-    assert finished == {}  # features are extracted while the odometry runs
+    assert list(finished) == ["calibration of walk"]  # features are extracted while the odometry runs
     assert command(walk, "--config", settings, "--out", out).exit_code == 0
     for name in ALWAYS_EQUAL:
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
@@ -252,6 +253,29 @@ def test_optimize_missing_files_are_written_again(done: Path, walk: Path, settin
     assert command(walk, "--config", settings, "--out", out).exit_code == 0
     for name in (*ALWAYS_EQUAL, "colmap/sparse/0/points3D.bin", "summary.json"):
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
+
+
+def test_optimize_exact_file_stays(walk: Path, done: Path) -> None:
+    used, of_file = load_rig(done / "walk/odometry/rig.yaml"), open_source(walk).rig
+    np.testing.assert_allclose(used.left2_T_left1(), of_file.left2_T_left1(), atol=1e-12)
+    (found,) = json.loads((done / "summary.json").read_text())["sessions"][0]["calibration"]
+    assert found.startswith("calibration: as in the rig file")
+
+
+@pytest.mark.usefixtures("without_plots")
+def test_optimize_wrong_file_is_calibrated_first(walk: Path, tmp_path: Path) -> None:
+    wrong = draw(open_source(walk).rig, CalibrationError.of_level(2, ["left-right-rotation"]), seed=1).written_rig
+    save_rig(wrong, tmp_path / "wrong.yaml")
+    (tmp_path / "as_it_is.yaml").write_text("calibration: {online: false}")
+    errors = {}
+    for config in ("default", tmp_path / "as_it_is.yaml"):
+        out = tmp_path / Path(config).stem
+        done = command(walk, "--rig", tmp_path / "wrong.yaml", "--no-loops", "--config", config, "--out", out)
+        assert done.exit_code == 0, done.output
+        assert ("walk: calibration corrected: " in done.stdout) == (config == "default")
+        (session,) = json.loads((out / "summary.json").read_text())["sessions"]
+        errors[out.name] = session["ate_rmse"]["optimized"]["position_m"]
+    assert errors["default"] < 0.3 * errors["as_it_is"]
 
 
 @pytest.mark.usefixtures("without_plots")
@@ -309,7 +333,14 @@ def test_optimize_without_loops_needs_no_extra(walk: Path, tmp_path: Path, monke
 @pytest.mark.skipif(not CLIP.is_dir(), reason="shared/data/euroc_mh01_clip is absent")
 @pytest.mark.usefixtures("without_plots")
 def test_optimize_real_recording_improves_on_online(tmp_path: Path) -> None:
-    done = command(CLIP, "--out", tmp_path / "clip")
-    assert done.exit_code == 0, done.output
-    (session,) = json.loads((tmp_path / "clip" / "summary.json").read_text())["sessions"]
-    assert session["ate_rmse"]["optimized"]["position_m"] < 0.95 * session["ate_rmse"]["online"]["position_m"]
+    """With the files as they are, and no less where they are calibrated first."""
+    (tmp_path / "as_it_is.yaml").write_text("calibration: {online: false}")
+    errors = {}
+    for config in ("default", tmp_path / "as_it_is.yaml"):
+        out = tmp_path / Path(config).stem
+        done = command(CLIP, "--config", config, "--out", out)
+        assert done.exit_code == 0, done.output
+        (session,) = json.loads((out / "summary.json").read_text())["sessions"]
+        errors[out.name] = {name: each["position_m"] for name, each in session["ate_rmse"].items()}
+    assert errors["as_it_is"]["optimized"] < 0.95 * errors["as_it_is"]["online"]
+    assert errors["default"]["optimized"] < 0.95 * errors["as_it_is"]["online"]

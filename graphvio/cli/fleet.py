@@ -66,7 +66,9 @@ def optimize(
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     refine_calibration: Annotated[
         bool,
-        typer.Option("--refine-calibration", help="Calibrate each rig first, as calibrate --what all does."),
+        typer.Option(
+            "--refine-calibration", help="Also estimate where the pairs are, and the IMU's time offset, in the graph."
+        ),
     ] = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,

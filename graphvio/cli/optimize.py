@@ -53,7 +53,9 @@ def optimize(
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     refine_calibration: Annotated[
         bool,
-        typer.Option("--refine-calibration", help="Calibrate each rig first, as calibrate --what all does."),
+        typer.Option(
+            "--refine-calibration", help="Also estimate where the pairs are, and the IMU's time offset, in the graph."
+        ),
     ] = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
@@ -61,9 +63,10 @@ def optimize(
 ) -> None:
     """Optimise the trajectory of recorded sessions from all their measurements.
 
-    Runs the odometry, finds places that are seen again, by any camera, and optimises everything as one graph. Several
-    sessions of one place are brought into one frame. An interrupted run is continued by the same command with the same
-    --out.
+    Calibrates the rig from the whole recording, runs the odometry, finds places that are seen again, by any camera, and
+    optimises everything as one graph. Several sessions of one place are brought into one frame. An interrupted run is
+    continued by the same command with the same --out. A configuration with calibration: {online: false} takes the rig
+    file as it is.
 
     Ends with exit code 0; with 2 where the input cannot be used; with 3 where less than 90 % of a session's framesets
     have a pose (the results are written all the same); with 130 after Ctrl-C.
@@ -120,7 +123,7 @@ def optimize(
     except KeyboardInterrupt:
         warn(f"interrupted; the same command with --out {folder} continues from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    complete = [_warn_of(folder / session.record.name / "odometry") for session in found.sessions]
+    complete = [_print_session(folder / session.record.name) for session in found.sessions]
     publish(json.loads((folder / "summary.json").read_text(encoding="utf-8")) | {"results": str(folder)})
     print_summary(found, folder)
     if not all(complete):
@@ -139,14 +142,20 @@ def _show_stages(bars: Progress) -> Callable[[str, float, float], None]:
     return show
 
 
-def _warn_of(odometry: Path) -> bool:
-    """Print the odometry's warnings on a session, and return whether most framesets have a pose."""
+def _print_session(session: Path) -> bool:
+    """Print what was found of a session's calibration, and warnings; return whether most framesets have a pose."""
+    from graphvio.optimization.session_calibration import session_findings
+
+    odometry = session / "odometry"
+    findings = session_findings(session)
+    for sentence in findings:
+        typer.echo(f"{session.name}: {sentence}")
     summary = json.loads((odometry / "summary.json").read_text(encoding="utf-8"))
     for warning in summary["warnings"]:
-        warn(f"{warning}; try --refine-calibration, or graphvio calibrate")
+        warn(warning if findings else f"{warning}; let it be calibrated first (calibration: {{online: true}})")
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary["input_faults"].items()))
     if faults:
-        typer.echo(f"faults of {odometry.parent.name}: {faults}")
+        typer.echo(f"faults of {session.name}: {faults}")
     is_complete = bool(summary["completion"] >= MIN_COMPLETION)
     if not is_complete:
         share = 100 * summary["completion"]

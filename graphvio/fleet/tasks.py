@@ -104,7 +104,7 @@ def odometry(job: Job) -> Marker:
     """Run the odometry; its figures are those of the summary, and ``parts``, the number of tasks for features."""
 
     def work(task: _Task) -> dict[str, Any]:
-        if job.calibrates:
+        if task.stages.calibrates_first:
             task.stages.calibrate(0)
         record = task.stages.record(0)
         summary = json.loads((task.folder / job.name / "odometry" / "summary.json").read_text(encoding="utf-8"))
@@ -203,7 +203,7 @@ class _Task:
             for name in self.done[stage].files:
                 self.fetched.add(name)
                 self.storage.fetch(name, self.folder / name)
-        if ODOMETRY in stages and self.job.calibrates:
+        if ODOMETRY in stages and self.stages.calibrates_first:
             self.stages.use_calibrated(0)
 
     def record(self) -> SessionRecord:

@@ -77,8 +77,10 @@ class RecordedCalibration:
         what: one of `GROUPS`.
         file_rig: of the rig file.
         batch: what all windows say.
-        halves: what the windows of the first and of the second half say, or None for a short recording.
+        halves: what the windows of the first and of the second half say, or None for a short recording, and where they
+            were not wanted.
         end_ns: stamp of the last frameset.
+        is_file_exact: whether the odometry found nothing that speaks against the rig file.
         all_findings: what is known of all parts where none is kept as in the file.
     """
 
@@ -87,6 +89,7 @@ class RecordedCalibration:
     batch: Batch
     halves: tuple[Batch, Batch] | None
     end_ns: int
+    is_file_exact: bool
     all_findings: list[Finding]
 
     @cached_property
@@ -161,6 +164,7 @@ def calibrate_recording(
     what: str = "all",
     config: Config | None = None,
     on_progress: Progress = lambda *_: None,
+    compares_halves: bool = True,
 ) -> RecordedCalibration:
     """Run the odometry over a recording, and calibrate its rig from all windows of the self-calibration.
 
@@ -170,6 +174,7 @@ def calibrate_recording(
         what: one of `GROUPS`; other parameters are kept as in the file.
         config: of the odometry.
         on_progress: follows the work.
+        compares_halves: whether the two halves of the recording are calibrated by themselves as well.
 
     Returns:
         The calibrated rig, and what the recording showed of each parameter.
@@ -192,20 +197,21 @@ def calibrate_recording(
             f"{_MIN_WINDOWS} are wanted; walk for half a minute with turns, near textured surfaces"
         )
     prior_rig = _with_fixed(rig, _FIXED[what])
-    assert odometry.calibration is not None, "the configuration asks for it"
-    first_guess, all_findings = odometry.calibration.posterior.mean, odometry.calibration_findings
-    batch = calibrate_windows(prior_rig, windows, first_guess, lambda k, n: on_progress("all windows", k, n))
+    online = odometry.calibration
+    assert online is not None, "the configuration asks for it"
+    judged = end_ns, online.is_file_exact, odometry.calibration_findings
+    batch = calibrate_windows(prior_rig, windows, online.posterior.mean, lambda k, n: on_progress("all windows", k, n))
     if sum(batch.left_out) > len(windows) // 2:
         raise CalibrationError(
             f"{sum(batch.left_out)} of {len(windows)} windows contradict the others: did the calibration change on the "
             "way, or is what is kept as in the file wrong (--what all)?"
         )
-    if len(windows) < _MIN_OF_HALVES:
-        return RecordedCalibration(what, rig, batch, None, end_ns, all_findings)
+    if len(windows) < _MIN_OF_HALVES or not compares_halves:
+        return RecordedCalibration(what, rig, batch, None, *judged)
     middle, mean = len(windows) // 2, batch.estimate.posterior.mean
     first = calibrate_windows(prior_rig, windows[:middle], mean, lambda k, n: on_progress("first half", k, n))
     second = calibrate_windows(prior_rig, windows[middle:], mean, lambda k, n: on_progress("second half", k, n))
-    return RecordedCalibration(what, rig, batch, (first, second), end_ns, all_findings)
+    return RecordedCalibration(what, rig, batch, (first, second), *judged)
 
 
 def _windows(

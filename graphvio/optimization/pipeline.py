@@ -1,8 +1,8 @@
-"""Optimisation of recordings, stage by stage: odometry, features, loop closures, graph, map."""
+"""Optimisation of recordings, stage by stage: calibration, odometry, features, loop closures, graph, map."""
 
 from __future__ import annotations
 
-import logging
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,8 +12,7 @@ from pathlib import Path
 
 from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
-from graphvio.errors import CalibrationError, TrajectoryError
-from graphvio.odometry.recorded_calibration import calibrate_recording
+from graphvio.errors import TrajectoryError
 from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
 from graphvio.optimization.loops.ahead import FeaturesAhead
@@ -26,6 +25,7 @@ from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.point_cloud import model_points, ply
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.optimization.report.write import write_plan, write_report
+from graphvio.optimization.session_calibration import FINDINGS, calibrated_rig
 from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import RunListener, run
 from graphvio.results import ResultWriter
@@ -38,7 +38,7 @@ from graphvio.trajectory_files import load_trajectory
 from graphvio.version import __version__
 
 DATABASE = "database.db"
-_log = logging.getLogger(__name__)
+_REFINED = "rig-refined.yaml"
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage, how much of it is done, and how much there is."""
@@ -68,8 +68,9 @@ def optimize_sessions(
         out: folder of the results: new, or that of an interrupted optimisation of the same, which is continued.
         config: of all stages.
         with_loops: whether to find loop closures and write a map, which needs the extra ``maps``.
-        calibrates: whether the rigs are calibrated first, from each recording as a whole; and in the graph the
-            extrinsics of the pairs and the IMU's time offset once more.
+        calibrates: whether the extrinsics of the pairs and the IMU's time offset are variables of the graph. Each rig
+            is calibrated from its whole recording before, here and where the configuration has
+            ``calibration: {online: true}``.
         on_progress: called with the progress of each stage.
 
     Returns:
@@ -80,7 +81,7 @@ def optimize_sessions(
     """
     sessions = _sessions(sources)
     stages = Stages(sessions, Path(out), config, with_loops=with_loops, calibrates=calibrates, on_progress=on_progress)
-    if calibrates:
+    if stages.calibrates_first:
         for number in range(len(sessions)):
             stages.calibrate(number)
     records = []
@@ -108,6 +109,7 @@ class Stages:
 
     Attributes:
         inputs: name -> value of everything that determines the results.
+        calibrates_first: whether each rig is to be calibrated before its session's odometry.
 
     Raises:
         OptimizationError: if the folder cannot be used.
@@ -125,6 +127,7 @@ class Stages:
     ) -> None:
         self._sessions = sessions
         self._calibrates = calibrates
+        self.calibrates_first = calibrates or config.estimates_calibration
         self._config = config
         self._on_progress = on_progress or (lambda *_: None)
         self.inputs = {each.name: _identity(each.source) for each in sessions} | {
@@ -140,26 +143,22 @@ class Stages:
     def calibrate(self, number: int) -> None:
         """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays."""
         session = self._sessions[number]
-        name, stage = f"{session.name}/rig-refined.yaml", f"calibration of {session.name}"
-        path = self._space.folder / name
+        stage, names = f"calibration of {session.name}", [f"{session.name}/{name}" for name in (_REFINED, FINDINGS)]
         if not self._space.has_finished(stage):
             totals = {"odometry": session.source.frameset_count}
-
-            def on_progress(part: str, done: int, total: int) -> None:
-                self._on_progress(f"{stage}: {part}", done, totals.get(part, total))
-
-            rig = session.source.rig
-            try:
-                rig = calibrate_recording(session.source, rig, "all", self._config, on_progress).rig
-            except CalibrationError as error:
-                _log.warning("%s: %s", session.name, error)
-            self._space.write(name, to_text(rig, path.parent).encode())
-            self._space.finish(stage, name)
+            rig, sentences = calibrated_rig(
+                session.source,
+                self._config,
+                lambda part, done, total: self._on_progress(f"{stage}: {part}", done, totals.get(part, total)),
+            )
+            self._space.write(names[0], to_text(rig, self._space.folder / session.name).encode())
+            self._space.write(names[1], (json.dumps(sentences, indent=2) + "\n").encode())
+            self._space.finish(stage, *names)
         self.use_calibrated(number)
 
     def use_calibrated(self, number: int) -> None:
         """Use the rig that `calibrate` has written, in this folder or in another one that it was copied from."""
-        self._rigs[number] = load_rig(self._space.folder / f"{self._sessions[number].name}/rig-refined.yaml")
+        self._rigs[number] = load_rig(self._space.folder / self._sessions[number].name / _REFINED)
 
     def record(self, number: int, *, with_features: bool = False) -> SessionRecord:
         """Run the odometry on a session, write its results, and return what it measured.
@@ -178,7 +177,7 @@ class Stages:
                 on_views=recorder.add_views,
                 on_progress=lambda progress: self._on_progress(stage, progress.framesets, progress.total),
             )
-            # All motions of a session must be measured with one calibration, that of the rig file.
+            # All motions of a session must be measured with one calibration.
             config = replace(self._config, calibration=CalibrationConfig(online=False))
             ahead = self._features_ahead(number) if with_features else None
             listeners = [listener]

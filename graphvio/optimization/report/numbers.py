@@ -17,6 +17,7 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.loops.closures import LoopClosure
 from graphvio.optimization.optimize import Optimization, OptimizedSession
 from graphvio.optimization.report.calibration import SessionCalibration, calibrations
+from graphvio.optimization.session_calibration import session_findings
 from graphvio.optimization.solver import Residuals
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig
@@ -83,6 +84,7 @@ class SessionNumbers:
     length_m: float  # along the optimised positions
     accuracy: Mapping[str, Accuracy] | None  # ATE by stage, or None
     no_accuracy: str  # why there is no ATE, or empty
+    calibration: Sequence[str]  # sentences on what was found before the odometry; empty if it was not calibrated
     online: Float  # (F, 4, 4) online poses in the optimised frames
     moved_m: Float  # (F,) distance between online and optimised positions
     moved_deg: Float  # (F,) angle between online and optimised rotations
@@ -157,7 +159,7 @@ def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], folder:
     is_used = np.array([not loop.refusal for loop in found.loops], dtype=bool)
     return Numbers(
         sessions=[
-            _session_numbers(session, truth, completion(folder, session.record.name), online)
+            _session_numbers(session, truth, folder, online)
             for session, truth, online in zip(found.sessions, truths, _online_in_frame(found), strict=True)
         ],
         parts=_parts(found),
@@ -208,7 +210,7 @@ def loop_errors(found: Optimization, stage: str) -> Float:
 
 
 def _session_numbers(
-    session: OptimizedSession, truth: Trajectory | None, completion: float | None, online: Float
+    session: OptimizedSession, truth: Trajectory | None, folder: Path, online: Float
 ) -> SessionNumbers:
     record = session.record
     accuracy, no_accuracy = _accuracy(session, truth)
@@ -218,12 +220,13 @@ def _session_numbers(
     return SessionNumbers(
         record.name,
         len(record.stamps_ns),
-        completion,
+        completion(folder, record.name),
         len(session.nodes.rows),
         float(record.stamps_ns[-1] - record.stamps_ns[0]) * 1e-9,
         float(sum(travelled(part)[-1] for part in np.split(session.nav_T_body[:, :3, 3], breaks))),
         accuracy,
         no_accuracy,
+        session_findings(folder / record.name),
         online,
         np.asarray(moved_m),
         np.asarray(moved_deg),

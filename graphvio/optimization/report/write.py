@@ -126,6 +126,7 @@ def _session(each: SessionNumbers) -> dict[str, Any]:
         "length_m": each.length_m,
         "ate_rmse": each.accuracy and {stage: asdict(value) for stage, value in each.accuracy.items()},
         "no_ate": each.no_accuracy,
+        "calibration": list(each.calibration),
         "moved": {
             "rms_m": _rms(each.moved_m),
             "max_m": float(each.moved_m.max()),
