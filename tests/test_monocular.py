@@ -33,13 +33,14 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import Measurements, adjust, covariance_of, equations, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
+from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.marginalisation import without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkNames, Landmarks
 from graphvio.monocular.states import Prior, States, first_prior
-from graphvio.monocular.structure import Eliminated, Structure, located, visual_equations
+from graphvio.monocular.structure import Eliminated, Structure, located
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.self_calibration.findings import Finding, findings

@@ -21,14 +21,13 @@ from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration import online
 from graphvio.self_calibration.adjustment import adjusted
-from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
-from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
-from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, _scratch, eliminate_landmarks
+from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
 from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector
+from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, new_scratch, observe
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import (
     BODY,
@@ -83,9 +82,9 @@ def test_observe_derivatives_equal_finite_differences(model: str, pair: int) -> 
         moved[:3, :3] = pose[:3, :3] @ so3_exp(pose_step[:3].copy())
         rows, step = np.zeros((4, COLUMNS)), np.zeros((2, PAIR))
         step[pair] = calibration_step
-        filled = _observe(
+        filled = observe(
             moved, calibration.moved(step.ravel()), pair, odom_T_landmark, landmark + point_step, np.zeros(2),
-            np.zeros(2), True, _scratch(), rows,
+            np.zeros(2), True, new_scratch(), rows,
         )  # fmt: skip
         assert filled == 4
         return rows

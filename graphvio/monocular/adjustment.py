@@ -9,9 +9,10 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.linear_algebra import cholesky, product, solve_lower, solve_rows, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.states import BIASES, GRAVITY, Prior, States, columns_of, inertial_columns, visual_columns
-from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located, visual_equations
+from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
 from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
 

@@ -8,8 +8,9 @@ from graphvio.arrays import Float
 from graphvio.linear_algebra import product, solve_rows
 from graphvio.measurements.window_views import FirstWindow
 from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements, times
+from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.states import BIASES, GRAVITY, Prior, States, columns_of, inertial_columns, visual_columns
-from graphvio.monocular.structure import Eliminated, visual_equations
+from graphvio.monocular.structure import Eliminated
 from graphvio.self_calibration.inertial import InertialStates, inertial_equations
 
 
