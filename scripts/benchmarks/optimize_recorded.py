@@ -28,7 +28,7 @@ from graphvio.warmup import warm_up
 AIM_CLOSURE_M, AIM_ATE = 0.05, 2.0
 AIMED_AT = "loop"
 WRONG_M, WRONG_DEG = 0.1, 2.0
-STAGES = ("odometry", "features", "loops", "graph", "map")
+STAGES = ("calibration", "odometry", "features", "loops", "graph", "map")
 _SOLVING = ("without loops", "with loops")
 
 
