@@ -21,6 +21,7 @@ from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.odometry.step import NewKeyframe, Step
 from graphvio.rig import Rig
+from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.simulation.simulator import make_simulator
 from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
@@ -107,6 +108,28 @@ def test_each_reference_is_a_keyframe_with_the_next_id(run: Run) -> None:
         np.testing.assert_array_equal(keyframe.odom_T_body, estimate.nav_T_body)
         np.testing.assert_array_equal(keyframe.covariance, estimate.covariance)
         assert set(np.unique(keyframe.landmarks.pair)) == {0, 1}
+
+
+def test_landmarks_are_those_of_the_calibration_in_force(run: Run, rig: Rig, measurements: list[Measurement]) -> None:
+    error = CalibrationError.of_level(3, ["left-right-rotation", "principal-point", "pair-transform"])
+    wrong = draw(rig, error, seed=1).written_rig
+    newest = run_of(wrong, until(measurements, 80)).keyframes[-1]
+    assert run.keyframes[-1].calibrated_rig is None  # the file is exact
+    assert newest.calibrated_rig is not None
+    in_force = newest.calibrated_rig
+
+    def error_px(used: Rig) -> float:
+        """How far landmarks are from where the right cameras see them."""
+        errors = []
+        for j, pair in enumerate(used.pairs):
+            of_pair, right_T_body = newest.landmarks.pair == j, pair.right.cam_T_body
+            pixels, _ = pair.right.project(
+                newest.landmarks.points_body[of_pair] @ right_T_body[:3, :3].T + right_T_body[:3, 3]
+            )
+            errors.append(np.median(np.abs(pixels - newest.landmarks.right_px[of_pair])))
+        return float(max(errors))
+
+    assert error_px(in_force) < 0.2 < error_px(wrong)
 
 
 @pytest.mark.parametrize("kind", ["imu", "vision", "filter", "in_turns"])

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,10 @@ from graphvio.errors import MapError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.mapping import saved_map
 from graphvio.mapping.mapper import Mapper
+from graphvio.rig import Rig
+from graphvio.rig_files import load_rig
+from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory_files import load_trajectory, save_trajectory
 
 pytest.importorskip("pycolmap", reason="maps need the extra maps")
@@ -93,6 +99,27 @@ def test_used_closures_are_right(made: Made) -> None:
         one, other = (made.truth[row_of[end.stamp_ns]] for end in (closure.reference, closure.current))
         error = se3_log(se3_inverse(se3_inverse(one) @ other) @ closure.reference_T_current)
         assert not is_used or np.linalg.norm(error[3:]) < 0.03
+
+
+class Calibrated(SyntheticFrontEnd):
+    """Has a rig file that is wrong, and keyframes that have the true one."""
+
+    def __init__(self, rig: Rig, *others: Any) -> None:
+        wrong = draw(rig, CalibrationError.of_level(3, ["left-right-rotation", "pair-transform"]), seed=1).written_rig
+        super().__init__(wrong, *others)
+        self._true_rig = rig
+
+    def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
+        for each in super().keyframes(from_id):
+            yield replace(each, calibrated_rig=self._true_rig)
+
+
+def test_places_are_seen_with_the_calibration_of_their_keyframe(made: Made, tmp_path: Path) -> None:
+    walk, _ = front_end(0, 240, seed=1, kind=Calibrated)
+    found = mapped(walk, save=tmp_path / "room")
+    np.testing.assert_array_equal(found.trajectory.nav_T_body, made.mapper.trajectory.nav_T_body)
+    saved = load_rig(tmp_path / "room" / "rig.yaml")  # that with which the map is asked for the next time
+    np.testing.assert_allclose(saved.left2_T_left1(), walk.rig.left2_T_left1(), atol=1e-9)
 
 
 def test_saved_map_is_complete(made: Made) -> None:

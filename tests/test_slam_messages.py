@@ -11,6 +11,7 @@ import pytest
 import served
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic import two_pair_rig
 
 from graphvio.errors import ServiceError
 from graphvio.measurements.estimate import Estimate, Status
@@ -58,6 +59,17 @@ def sent(message: Any) -> Any:
 def test_keyframe_round_trip(number: int, points: int) -> None:
     keyframe = served.keyframe(number, epoch=3, points=points)
     assert_same(keyframe, convert.keyframe_of(sent(convert.keyframe_message(keyframe, True, True))))
+
+
+def test_calibrated_rig_round_trip_is_one_object_for_all_keyframes() -> None:
+    rig = two_pair_rig()
+    one, other = (
+        convert.keyframe_of(sent(convert.keyframe_message(replace(served.keyframe(k), calibrated_rig=rig), True, True)))
+        for k in (1, 2)
+    )
+    assert one.calibrated_rig is not None
+    assert one.calibrated_rig is other.calibrated_rig
+    assert convert.rig_text(one.calibrated_rig) == convert.rig_text(rig)
 
 
 def test_images_and_descriptors_are_sent_on_request_only() -> None:

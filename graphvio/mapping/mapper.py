@@ -27,6 +27,7 @@ from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.features import PlaceObserver
 from graphvio.optimization.loops.motion_depth import NEIGHBOURS, PlaceMotion
 from graphvio.optimization.loops.verification import FreshView, View, crossings, verified
+from graphvio.rig import Rig
 from graphvio.slam.interface import SlamFrontEnd
 from graphvio.trajectory import Trajectory
 
@@ -56,7 +57,7 @@ class Mapper:
         self, front_end: SlamFrontEnd, config: Config, map: Path | str | None = None, folder: Path | None = None
     ) -> None:
         self._front_end = front_end
-        self._rig = front_end.rig
+        self._rig = front_end.rig  # as it is calibrated
         self._config = config
         self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-")) if folder is None else folder
         try:
@@ -71,7 +72,7 @@ class Mapper:
         self._recognition = Recognition(self._config.motion.seed)
         self._places: list[Place] = []
         if folder is not None:
-            kept = saved_map.load(folder, self._rig)
+            kept = saved_map.load(folder, self._front_end.rig)
             copy_database(folder / DATABASE, self._folder / DATABASE)
             self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
         self._first = len(self._places)  # first place of this session
@@ -129,9 +130,8 @@ class Mapper:
             MapError: If the folder contains other files, or cannot be written.
         """
         with self._working, self._lock:
-            saved_map.save(
-                saved_map.to_saved(self._graph, self._recognition, self._places), self._store, self._rig, Path(folder)
-            )
+            kept = saved_map.to_saved(self._graph, self._recognition, self._places)
+            saved_map.save(kept, self._store, self._front_end.rig, Path(folder))
 
     @property
     def trajectory(self) -> Trajectory:
@@ -180,6 +180,7 @@ class Mapper:
 
     def _take(self, new: NewPlace) -> None:
         keyframe, clock = new.keyframe, self._times
+        self._use(keyframe.calibrated_rig or self._front_end.rig)
         frameset = FrameSet(keyframe.stamp_ns, keyframe.images)
         with clock.stage("features"):
             seen = self._observer.look(frameset)
@@ -215,6 +216,12 @@ class Mapper:
         if self._recognition.is_due:
             with clock.stage("vocabulary"):
                 self._recognition.learn(self._descriptors)
+
+    def _use(self, rig: Rig) -> None:
+        """See the new place, and stored ones, with the calibration that is in force."""
+        if rig is not self._rig:
+            self._rig = self._store.rig = rig
+            self._observer = PlaceObserver(rig, self._config)
 
     def _may(self, earlier: int) -> bool:
         """Return whether a place may be compared with the newest one."""

@@ -29,6 +29,13 @@ _MIN_FREE_BYTES = 20_000_000  # for a place: COLMAP aborts the process when the 
 class PlaceStore:
     """COLMAP's database of the places' features, and the images of the places that were added in this session.
 
+    Args:
+        folder: For the database and the images.
+        rig: Cameras of the images.
+
+    Attributes:
+        rig: The rig with which stored places are seen; cameras keep their names.
+
     Raises:
         OptimizationError: If the database cannot be opened.
         MissingExtraError: If the extra ``maps`` is not installed.
@@ -36,7 +43,7 @@ class PlaceStore:
 
     def __init__(self, folder: Path, rig: Rig) -> None:
         self._folder = folder
-        self._rig = rig
+        self.rig = rig
         self._database = FeatureDatabase(folder / DATABASE)
         self._lock = threading.Lock()
 
@@ -46,9 +53,9 @@ class PlaceStore:
             if shutil.disk_usage(self._folder).free < _MIN_FREE_BYTES:
                 raise OSError(ENOSPC, os.strerror(ENOSPC))
             # The database comes last: unlike the images, it becomes a part of saved maps.
-            write_place(self._folder / _IMAGES, self._rig, session, frameset)
+            write_place(self._folder / _IMAGES, self.rig, session, frameset)
             with self._lock:
-                store_place(self._database, self._rig, session, frameset.stamp_ns, seen)
+                store_place(self._database, self.rig, session, frameset.stamp_ns, seen)
         except (OSError, RuntimeError) as error:
             # Nothing more can be stored; without the images, a map on the same disk may have room.
             shutil.rmtree(self._folder / _IMAGES, ignore_errors=True)
@@ -56,8 +63,8 @@ class PlaceStore:
 
     def view(self, session: str, stamp_ns: int) -> StoredView:
         """Return a stored place, for verification."""
-        frameset_at = partial(read_place, self._folder / _IMAGES, self._rig, session)
-        return StoredView(self._rig, session, stamp_ns, self._database, self._lock, frameset_at)
+        frameset_at = partial(read_place, self._folder / _IMAGES, self.rig, session)
+        return StoredView(self.rig, session, stamp_ns, self._database, self._lock, frameset_at)
 
     def descriptors(self, session: str, stamp_ns: int, j: int) -> AnyArray:
         """Return the descriptors (K, 128), uint8, of the left image, or the single one, of group j at a place."""
@@ -66,7 +73,7 @@ class PlaceStore:
 
     def name(self, session: str, stamp_ns: int, j: int) -> str:
         """Return the name of the left image, or the single one, of group j at a place."""
-        return image_name(session, self._rig.groups[j].left.name, stamp_ns)
+        return image_name(session, self.rig.groups[j].left.name, stamp_ns)
 
     def copy_to(self, folder: Path) -> None:
         """Copy the database, complete as it is now, to another folder."""

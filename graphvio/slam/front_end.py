@@ -45,7 +45,7 @@ class FrontEnd:
 
     @property
     def rig(self) -> Rig:
-        """Cameras and IMU of the keyframes."""
+        """Cameras and IMU of the keyframes, as in the rig file; see `Keyframe.calibrated_rig`."""
         return self._odometry.rig
 
     # ------------------------------------------------------------------ keyframes out
@@ -127,6 +127,7 @@ class FrontEnd:
             previous = None
         motion = None if previous is None else self._motion_since(previous, estimate, new)
         config = self._odometry.config
+        rig = self._odometry.refined_rig or self.rig
         keyframe = Keyframe(
             id=self.log.next_id,
             epoch=estimate.epoch,
@@ -137,10 +138,11 @@ class FrontEnd:
             previous_id=None if previous is None else previous.id,
             previous_T_body=None if motion is None else motion[0],
             relative_covariance=None if motion is None else motion[1],
-            landmarks=landmarks_of(self.rig, new, config.motion.pixel_sigma_px, self._describe),
+            landmarks=landmarks_of(rig, new, config.motion.pixel_sigma_px, self._describe),
             images={j: tuple(np.copy(image) for image in images) for j, images in new.images.items()}
             if config.keyframes.images
             else {},
+            calibrated_rig=None if rig is self.rig else rig,
         )
         self._previous = keyframe
         self._map_frame.add(keyframe)

@@ -23,7 +23,7 @@ class SlamFrontEnd(Protocol):
 
     @property
     def rig(self) -> Rig:
-        """Cameras and IMU of the keyframes."""
+        """Cameras and IMU of the keyframes, as in the rig file; see `Keyframe.calibrated_rig`."""
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
         """Yield keyframes as they come until the odometry has ended.

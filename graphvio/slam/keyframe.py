@@ -9,6 +9,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.measurements.estimate import Status
+from graphvio.rig import Rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +64,8 @@ class Keyframe:
         landmarks: Landmarks of all pairs and single cameras in the frameset.
         images: Index in `graphvio.rig.Rig.groups` -> (left, right) of a pair or (image,) of a single camera, uint8;
             empty unless requested.
+        calibrated_rig: The rig as the self-calibration knew it then, of which the landmarks are; None while the
+            front-end's own, that of the rig file, is in force.
     """
 
     id: int
@@ -76,6 +79,7 @@ class Keyframe:
     relative_covariance: Float | None
     landmarks: Landmarks
     images: Mapping[int, tuple[Image, ...]] = field(default_factory=dict)
+    calibrated_rig: Rig | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

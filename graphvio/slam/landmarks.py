@@ -32,7 +32,7 @@ def landmarks_of(rig: Rig, keyframe: NewKeyframe, pixel_sigma_px: float, describ
     Those of single cameras are where the state has them, if it locates points, or where the front-end does.
 
     Args:
-        rig: The rig.
+        rig: The rig, with the calibration that is in force.
         keyframe: Tracks and images.
         pixel_sigma_px: Standard deviation of a tracked corner in one image.
         describe: Computes descriptors in a left image, or None for no descriptors.

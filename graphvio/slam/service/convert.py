@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Mapping
 from dataclasses import replace
@@ -30,14 +31,16 @@ _INT64 = 2**63
 Value = float | int | str | None
 
 
+@functools.lru_cache(maxsize=4)  # many keyframes have the same one
 def rig_text(rig: Rig) -> str:
     """Return the text of a ``rig.yaml`` without masks, which are files on the server's machine."""
     bare = rig.with_cameras(lambda camera: as_written(replace(camera, mask=None), camera.body_T_cam))
     return native.to_text(bare, Path("/"))
 
 
+@functools.lru_cache(maxsize=4)
 def rig_of(text: str, origin: str) -> Rig:
-    """Parse the rig that a server sent.
+    """Parse the rig that a server sent; equal texts give the same one.
 
     Raises:
         RigError: If this version of graphvio cannot read it.
@@ -139,6 +142,7 @@ def keyframe_message(keyframe: Keyframe, with_images: bool, with_descriptors: bo
         previous_T_body=packed(keyframe.previous_T_body),
         relative_covariance=packed(keyframe.relative_covariance),
         landmarks=_landmarks_message(keyframe.landmarks, with_descriptors),
+        calibrated_rig_yaml="" if keyframe.calibrated_rig is None else rig_text(keyframe.calibrated_rig),
     )
     for pair, (left, *right) in sorted(keyframe.images.items()) if with_images else ():
         message.images.add(pair=pair, left=_image_message(left), right=_image_message(right[0]) if right else None)
@@ -160,6 +164,7 @@ def keyframe_of(message: Any) -> Keyframe:
         relative_covariance=maybe_floats(message.relative_covariance, (6, 6), f"{where}: relative_covariance"),
         landmarks=_landmarks_of(message.landmarks, where),
         images={each.pair: _images_of(each, where) for each in message.images},
+        calibrated_rig=rig_of(message.calibrated_rig_yaml, "keyframe") if message.calibrated_rig_yaml else None,
     )
 
 
