@@ -130,11 +130,12 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     """Call the kernels of tracking and of geometry."""
     rng = np.random.default_rng(0)
     pair = rig.groups[0]
-    width, height = pair.left.size_px
     tracker = PairTracker(pair, config)
-    noise = rng.integers(0, 256, size=(height, width), dtype=np.uint8)
+    noise, in_right = (
+        rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in (pair.left, pair.cameras[-1])
+    )
     for stamp_ns in range(2):
-        frame = tracker.observe(stamp_ns, noise, noise, np.eye(4), np.eye(4))
+        frame = tracker.observe(stamp_ns, noise, in_right, np.eye(4), np.eye(4))
         tracker.keep_keyframe_patches()
     correspond({0: frame}, {0: frame})
     if rig.singles:

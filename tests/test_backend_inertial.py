@@ -7,6 +7,7 @@ from synthetic import UP, filled_buffer, pose_at, velocity_at
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.preintegration import preintegrate, preintegration_params
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu
@@ -81,6 +82,12 @@ def test_one_coarse_axis_beside_fine_ones_is_not_stuck(noise: float) -> None:
         before = rate[0]
         assert buffer.add(sample(5 * MS * i, rate, force)) == ""
     assert 80 < changes < 4000
+
+
+def test_an_accelerometer_that_reads_zero_is_stuck() -> None:
+    buffer = ImuBuffer(50.0)
+    assert buffer.add(sample(0, force=(0.0, 0.0, 0.0))) == EventKind.IMU_STUCK
+    assert buffer.add(sample(5_000_000, force=(0.0, 0.0, 1e-3))) == ""  # in free fall
 
 
 def test_an_imu_that_repeats_itself_is_stuck() -> None:

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ import yaml
 from command_line import graphvio
 
 from graphvio.cli.requirements import REQUIRED
+from graphvio.rig_files import save_rig
+from graphvio.simulation import default_rig
 from graphvio.version import __version__
 
 
@@ -163,6 +166,7 @@ compare walk walk
 evaluate walk walk
 simulate hall --out a
 simulate room --out a --rig car
+simulate room --out a --rig named.yaml
 simulate room --out a --calibration-error 9
 simulate room --out a --rig-change fall
 simulate room --out a --calibration-error 1 --calibration-component lens
@@ -180,6 +184,8 @@ def test_refusals_are_short(room_walk: Path, tmp_path: Path) -> None:
     files = {"camchain.yaml": camchain, "rig.yaml": rig, "nothing.txt": "", "config.yaml": "motion: {colour: 1}"}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
+    named = default_rig().with_cameras(lambda camera: replace(camera, name=f"{camera.name}-links"))
+    save_rig(named, tmp_path / "named.yaml")
     (tmp_path / "empty").mkdir()
     (tmp_path / "walk").symlink_to(room_walk)
     for typed in WRONG.splitlines():

@@ -23,6 +23,14 @@ def test_images_must_fit_the_rig(wrong: AnyArray) -> None:
             checked(FrameSet(0, {0: (IMAGE, IMAGE), pair: images}), RIG)
 
 
+def test_images_of_a_buffer_are_made_writable() -> None:
+    """Kernels are compiled for one type of array, and to numba one that is only to be read is another."""
+    read_only = np.frombuffer(IMAGE.tobytes(), dtype=np.uint8).reshape(480, 640)
+    for image in checked(FrameSet(7, {0: (read_only, IMAGE)}), RIG).images[0]:
+        assert image.flags.writeable
+        np.testing.assert_array_equal(image, IMAGE)
+
+
 def test_images_are_made_contiguous() -> None:
     wide = np.arange(480 * 1280, dtype=np.uint32).astype(np.uint8).reshape(480, 1280)
     left, right = wide[:, :640], wide[:, 640:]

@@ -337,6 +337,7 @@ def test_malformed_measurements_are_refused(odometry: Odometry) -> None:
     for images, message in (
         ([(image, image)], "images is a list"),
         ({0: None}, "not one or two images"),
+        ({"front": (image, image)}, "'front' is no index"),
         ({0: (image, [[1, 2], [3, 4]])}, "something else than arrays"),
     ):
         with pytest.raises(MeasurementError, match=message):

@@ -174,6 +174,8 @@ def test_with_pairs_selects_pairs_in_order() -> None:
         rig.with_pairs([1, 1])
     with pytest.raises(RigError, match="there is no pair 3; choose from 0 to 2"):
         rig.with_pairs([0, 3])
+    with pytest.raises(RigError, match="has no stereo pairs"):
+        rig.without_pairs().with_pairs([0])
 
 
 def test_save_rig_writes_mask_relative_to_file(tmp_path: Path) -> None:

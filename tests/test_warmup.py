@@ -4,6 +4,7 @@ import fcntl
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -67,6 +68,13 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
         odometry.finish()
         assert keyframes
         assert compiled() - before == set()
+
+
+def test_warm_up_of_a_pair_with_images_of_two_sizes() -> None:
+    rig = default_rig()
+    pair = rig.pairs[0]
+    small = replace(pair.right, size_px=(400, 200), distortion=np.zeros(8))
+    warm_up(replace(rig, pairs=(replace(pair, right=small),)), Config())
 
 
 def test_no_kernel_of_single_cameras_is_compiled_after_the_warm_up(room_walk: Path) -> None:

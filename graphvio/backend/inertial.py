@@ -59,6 +59,8 @@ class ImuBuffer:
         rate, force = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()  # numpy is slow for three
         if not all(map(isfinite, (*rate, *force))):
             return EventKind.IMU_NOT_FINITE
+        if not any(force):  # nor does free fall give exact zeros
+            return EventKind.IMU_STUCK
         if max(map(abs, rate)) > _MAX_RATE or max(map(abs, force)) > _MAX_FORCE:
             return EventKind.IMU_OUT_OF_RANGE
         newest_ns = self.newest_ns

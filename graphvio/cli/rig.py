@@ -63,8 +63,8 @@ def _description(joined: Rig, guessed: tuple[str, ...]) -> dict[str, Any]:
             {
                 "name": group.name,
                 "cameras": [camera.name for camera in group.cameras],
-                "model": group.left.model,
-                "size_px": list(group.left.size_px),
+                "models": [camera.model for camera in group.cameras],
+                "sizes_px": [list(camera.size_px) for camera in group.cameras],
                 "baseline_m": group.baseline_m if isinstance(group, StereoPair) else None,
                 "position_in_body_m": group.left.body_T_cam[:3, 3].tolist(),
                 "viewing_direction_in_body": group.left.body_T_cam[:3, 2].tolist(),
@@ -79,10 +79,11 @@ def _description(joined: Rig, guessed: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _group_line(group: dict[str, Any]) -> str:
-    width, height = group["size_px"]
+    lenses = zip(group["sizes_px"], group["models"], strict=True)
+    lens = " and ".join(dict.fromkeys(f"{width}x{height} {model}" for (width, height), model in lenses))
     pair = "single camera" if group["baseline_m"] is None else f"baseline {1e3 * group['baseline_m']:.1f} mm"
     return (
-        f"{group['name']}: {' and '.join(group['cameras'])}, {width}x{height} {group['model']}, {pair}, at "
+        f"{group['name']}: {' and '.join(group['cameras'])}, {lens}, {pair}, at "
         f"{_vector(group['position_in_body_m'])} m in body, looks along {_vector(group['viewing_direction_in_body'])}"
         + (" (guessed)" if group["place_is_guessed"] else "")
     )

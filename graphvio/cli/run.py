@@ -50,7 +50,7 @@ def run(
     """Estimate the trajectory of a recording.
 
     Ends with exit code 0; with 2 where the input cannot be used; with 3 where less than 90 % of the framesets
-    have a pose (the results are written all the same).
+    since the initialisation have a pose (the results are written all the same).
 
     Examples:
 

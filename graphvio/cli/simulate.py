@@ -9,9 +9,10 @@ import typer
 
 from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import framesets_bar
+from graphvio.cli.shared import EXIT_INTERRUPTED, framesets_bar, warn
 
 if TYPE_CHECKING:
+    from graphvio.rig import Rig
     from graphvio.simulation.recording import SimulatedRecording
 
 
@@ -99,14 +100,36 @@ def simulate(
         error = CalibrationError.of_level(calibration_error, calibration_component)
     elif calibration_component or calibration_seed is not None:
         raise typer.BadParameter("--calibration-component and --calibration-seed need --calibration-error LEVEL")
-    with framesets_bar() as bar:
-        task = bar.add_task(f"rendering {name}", total=None)
-        recording = simulate_recording(
-            name, out, duration_s=duration, seed=seed, rate_hz=rate, trigger_offset_ms=trigger_offset_ms,
-            calibration_error=error, calibration_seed=calibration_seed, rig_change=rig_change, rig=rig_of(rig),
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )  # fmt: skip
+    true_rig = rig_of(rig)
+    _check_names(true_rig, rig)
+    try:
+        with framesets_bar() as bar:
+            task = bar.add_task(f"rendering {name}", total=None)
+            recording = simulate_recording(
+                name, out, duration_s=duration, seed=seed, rate_hz=rate, trigger_offset_ms=trigger_offset_ms,
+                calibration_error=error, calibration_seed=calibration_seed, rig_change=rig_change, rig=true_rig,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        warn(f"interrupted; {out} has only a part of the images: remove it")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
     _print_recording(recording)
+
+
+def _check_names(rig: Rig, file: str) -> None:
+    """Refuse names of cameras that the EuRoC/ASL layout does not have.
+
+    Raises:
+        RigError: if there is one.
+    """
+    from graphvio.errors import RigError
+
+    names = [camera.name for camera in rig.cameras]
+    wrong = [name for name in names if not (name.startswith("cam") and name[3:].isdecimal())]
+    if wrong or "cam0" not in names:
+        raise RigError(
+            f"{file}: cameras are called {', '.join(names)}; the EuRoC/ASL layout wants cam0, cam1, ...: rename them"
+        )
 
 
 def _print_recording(recording: SimulatedRecording) -> None:

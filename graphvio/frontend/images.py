@@ -43,7 +43,7 @@ def _checked(image: Image, camera: Camera) -> Image:
             f"camera {camera.name}: image has shape {image.shape} and type {image.dtype}; the rig says grey, "
             f"({height}, {width}), uint8"
         )
-    return np.ascontiguousarray(image)
+    return np.require(image, requirements=("C", "W"))  # kernels are compiled for one type of array
 
 
 def _checked_mask(mask: AnyArray | None, camera: Camera) -> Image | None:

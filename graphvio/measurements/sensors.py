@@ -102,6 +102,10 @@ def checked_measurement(measurement: Measurement) -> Measurement:
             f"frameset at {stamp_ns}: images is a {type(pairs).__name__}; map pairs to (left, right)"
         )
     for pair, images in pairs.items():
+        if not isinstance(pair, int | np.integer):
+            raise MeasurementError(
+                f"frameset at {stamp_ns}: {pair!r} is no index of a pair or single camera; give a number"
+            )
         if not isinstance(images, Sequence | np.ndarray) or len(images) not in (1, 2):
             raise MeasurementError(
                 f"frameset at {stamp_ns}: group {pair} has not one or two images; give (left, right), or (image,)"

@@ -188,6 +188,8 @@ class MonocularEstimator:
 
     def finish(self) -> None:
         """Declare all poses of the window final."""
+        if self._window is None and self._is_initialised and not self._first_pose_ns and not self._is_reported:
+            self._report_not_initialised(self._latest_ns)
         if self._window is not None:
             if self._on_views is not None:
                 while self._window.states.stamps_ns[0] < self._first_pose_ns:
@@ -292,14 +294,17 @@ class MonocularEstimator:
             if window is not None:
                 return self._begin(window, stamp_ns, is_keyframe)
         if not self._is_reported and stamp_ns - self._since_ns > _REPORT_AFTER_NS:
-            self._is_reported = True
-            self._report(
-                stamp_ns,
-                EventKind.NOT_INITIALISED,
-                f"{(stamp_ns - self._since_ns) * 1e-9:.1f} s after the initialisation {self._initialiser.reason}; go "
-                "on moving: speed up, brake and turn",
-            )
+            self._report_not_initialised(stamp_ns)
         return StateUpdate(Status.INITIALISING)
+
+    def _report_not_initialised(self, stamp_ns: int) -> None:
+        self._is_reported = True
+        self._report(
+            stamp_ns,
+            EventKind.NOT_INITIALISED,
+            f"{(stamp_ns - self._since_ns) * 1e-9:.1f} s after the initialisation {self._initialiser.reason}; go "
+            "on moving: speed up, brake and turn",
+        )
 
     def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Begin with a window whose scale is known."""

@@ -10,6 +10,7 @@ import csv
 import hashlib
 import io
 import json
+import os
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -269,6 +270,7 @@ class ResultWriter:
             save_rig(refined_rig, self.folder / "rig-refined.yaml")
         self._write_at_once("trajectory_smoothed.txt", "".join(lines))
         self._write_at_once("summary.json", json.dumps(asdict(summary), indent=2, allow_nan=False) + "\n")
+        name = os.fsencode(self.folder.name).decode(errors="replace")  # what is no UTF-8 cannot be plotted
         plot_run(
             self.folder / "trajectory.png",
             trajectory,
@@ -277,10 +279,10 @@ class ResultWriter:
             lost_ns=self._lost if len(trajectory) else (),
             truth=true_trajectory,
             evaluation=evaluation,
-            name=self.folder.name,
+            name=name,
         )
         if self._is_calibrated:
-            self._calibrations.plot(self.folder / "calibration.png", self._last_ns, self.folder.name)
+            self._calibrations.plot(self.folder / "calibration.png", self._last_ns, name)
         return summary
 
     def _add_report(self, stamp_ns: int, name: str, report: PairReport) -> None:

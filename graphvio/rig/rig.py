@@ -91,6 +91,8 @@ class Rig:
         Raises:
             RigError: if an index does not exist or is repeated.
         """
+        if indices and not self.pairs:
+            raise RigError(f"{self.name}: has no stereo pairs; choose among its cameras")
         for index in indices:
             if not 0 <= index < len(self.pairs):
                 raise RigError(f"{self.name}: there is no pair {index}; choose from 0 to {len(self.pairs) - 1}")
