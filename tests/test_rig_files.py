@@ -267,6 +267,7 @@ def test_load_rig_pair_without_baseline_or_common_view_raises(tmp_path: Path) ->
     ("name", "content", "message"),
     [
         ("rig.yaml", b"graphvio_rig: 1\npairs: [", "line 2 is not valid YAML"),
+        ("rig.yaml", b"graphvio_rig: 1\npairs: []\nname: a\nname: b\n", "line 4 .*name is there twice"),
         ("rig.yaml", b"- 1\n- 2\n", "must be a mapping"),
         ("rig.yaml", b"", "graphvio_rig is missing"),
         ("rig.yaml", b"\xff\xfe\x00", "no text file"),

@@ -114,7 +114,7 @@ def test_readout_motion_of_a_rate_that_changes() -> None:
     buffer = ImuBuffer(100.0)
     for stamp_ns in range(0, 60_000_000, 5_000_000):
         rate = MOTION.angular_velocity + 0.1 + 1e-9 * (stamp_ns - 12_000_000) * MOTION.angular_acceleration
-        buffer.add(ImuSample(stamp_ns, rate, np.zeros(3)))
+        buffer.add(ImuSample(stamp_ns, rate, np.array([0.0, 0.0, 9.81])))
     interval = buffer.interval(12_000_000, 32_000_000)
     assert interval is not None
     found = ReadoutMotion.accelerated(interval, np.full(3, 0.1), MOTION.velocity, MOTION.acceleration)

@@ -35,6 +35,14 @@ def test_stamps_in_other_units_are_refused(unit: str, tmp_path: Path) -> None:
         read_frame_csv(path, FaultLog("walk"))
 
 
+def test_rows_in_reverse_are_refused(tmp_path: Path) -> None:
+    path = imu_csv(tmp_path)
+    first, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([first, *reversed(rows)]) + "\n")
+    with pytest.raises(SourceError, match=r"data\.csv: stamps decrease from row to row"):
+        read_imu_csv(path, FaultLog("walk"))
+
+
 @pytest.mark.parametrize(("force", "faults"), [(1.0, 1), (9.7, 0), (14.0, 0), (981.0, 1)])
 def test_accelerometer_in_other_units_is_reported(force: float, faults: int, tmp_path: Path) -> None:
     log = FaultLog("walk")

@@ -120,6 +120,18 @@ class Section:
         return {name: self.number(key) for name, key in names.items()}
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """Refuses a key that a mapping has twice, of which YAML would silently take the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is there twice", key.start_mark)
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else id(key))
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path) -> Section:
     """Read a YAML file, also as Kalibr and OpenCV write it; an empty file is an empty mapping.
 
@@ -134,7 +146,7 @@ def parse_yaml(text: str, path: Path) -> Section:
     text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # OpenCV's `%YAML:1.0` is no valid directive
     text = text.replace("!!opencv-matrix", "")
     try:
-        values = yaml.safe_load(text)
+        values = yaml.load(text, _UniqueKeys)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""

@@ -118,8 +118,10 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
 def _refuse_other_units(stamps_ns: Int, path: Path) -> None:
     """Refuse stamps of a whole table that can only be in seconds, milliseconds or microseconds."""
     if len(stamps_ns) >= _MIN_ROWS and (period_ns := float(np.median(np.diff(stamps_ns)))) < _MIN_PERIOD_NS:
+        if period_ns < 0.0:
+            raise SourceError(f"{path}: stamps decrease from row to row; sort the rows by their stamps")
         raise SourceError(
-            f"{path}: rows are {max(period_ns, 0.0):g} ns apart in the median; stamps have to be whole nanoseconds, "
+            f"{path}: rows are {period_ns:g} ns apart in the median; stamps have to be whole nanoseconds, "
             "not seconds, milliseconds or microseconds"
         )
 
