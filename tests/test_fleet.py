@@ -36,6 +36,7 @@ from graphvio.warmup import warm_up
 SESSIONS, FRAMES, CORRUPT = 20, 18, "walk-07"
 PLACES_PER_TASK = 2
 CONFIG = """
+calibration: {online: false}  # a second shows nothing of it
 optimization:
   features: 100
   place_distance_m: 0.1
