@@ -17,8 +17,11 @@ import graphvio.kernel_cache
 import graphvio.kernels
 import graphvio.warmup
 from graphvio import FrameSet, ImuSample, Odometry
+from graphvio.arrays import Image
 from graphvio.cli import app
 from graphvio.config import Config
+from graphvio.frontend.tracker import PairTracker
+from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.simulation import default_rig, make_simulator
 from graphvio.slam import FrontEnd
@@ -70,11 +73,19 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
         assert compiled() - before == set()
 
 
-def test_warm_up_of_a_pair_with_images_of_two_sizes() -> None:
-    rig = default_rig()
-    pair = rig.pairs[0]
+def test_warm_up_of_a_pair_gives_each_camera_images_of_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels trust the sizes: rows that are not there would be read and written."""
+    pair = default_rig().pairs[0]
     small = replace(pair.right, size_px=(400, 200), distortion=np.zeros(8))
-    warm_up(replace(rig, pairs=(replace(pair, right=small),)), Config())
+    rig, given, observe = replace(default_rig(), pairs=(replace(pair, right=small),)), set(), PairTracker.observe
+
+    def noting(self: PairTracker, stamp_ns: int, left: Image, right: Image, *others: Any) -> PairFrame:
+        given.add((left.shape[::-1], right.shape[::-1]))
+        return observe(self, stamp_ns, left, right, *others)
+
+    monkeypatch.setattr(PairTracker, "observe", noting)
+    warm_up(rig, Config())
+    assert given == {(pair.left.size_px, small.size_px)}
 
 
 def test_no_kernel_of_single_cameras_is_compiled_after_the_warm_up(room_walk: Path) -> None:

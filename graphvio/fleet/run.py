@@ -63,7 +63,8 @@ def optimize_fleet(
         config: configuration of all stages.
         rig: rig of all sessions; None takes the recordings' own.
         with_loops: whether loop closures are searched, which needs the extra ``maps``.
-        calibrates: whether each rig is calibrated first, see `graphvio.optimization.pipeline.optimize_sessions`.
+        calibrates: whether the graphs have extrinsics and time offset as variables, see
+            `graphvio.optimization.pipeline.optimize_sessions`.
         reading: what is read of each recording; None for all of it.
         scheduler: address of a Dask scheduler; None takes workers on this machine.
         workers: processes on this machine; None takes `default_workers`.

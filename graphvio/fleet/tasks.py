@@ -78,7 +78,7 @@ class Job:
     with_loops: bool  # whether loop closures are searched
     places_per_task: int  # maximum number of places whose features one task extracts
     reading: Reading = Reading()  # what is read of the recording
-    calibrates: bool = False  # whether the rig is calibrated from the whole recording first
+    calibrates: bool = False  # whether the graph has extrinsics and time offset as variables
     version: str = __version__  # version of graphvio
 
     @property

@@ -57,7 +57,6 @@ class Mapper:
         self, front_end: SlamFrontEnd, config: Config, map: Path | str | None = None, folder: Path | None = None
     ) -> None:
         self._front_end = front_end
-        self._rig = front_end.rig  # as it is calibrated
         self._config = config
         self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-")) if folder is None else folder
         try:
@@ -77,8 +76,8 @@ class Mapper:
             self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
         self._first = len(self._places)  # first place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)
-        self._store = PlaceStore(self._folder, self._rig)
-        self._observer = PlaceObserver(self._rig, self._config)
+        self._store = PlaceStore(self._folder, self._front_end.rig)
+        self._observer = PlaceObserver(self._front_end.rig, self._config)
         self._share = _SEARCHING_SHARE if self._first else 1.0  # of the distance between places
         self._intake = Intake(self._front_end, settings, lambda: self._share)
         self._keyframe_ids: list[int] = []
@@ -204,7 +203,7 @@ class Mapper:
         found = []
         for earlier in similar:
             with clock.stage("verification"):
-                closure = self._verified(earlier, number, FreshView(self._rig, frameset, seen))
+                closure = self._verified(earlier, number, FreshView(self._store.rig, frameset, seen))
             self._tried += 1
             if closure is not None:
                 found.append(closure)
@@ -219,8 +218,8 @@ class Mapper:
 
     def _use(self, rig: Rig) -> None:
         """See the new place, and stored ones, with the calibration that is in force."""
-        if rig is not self._rig:
-            self._rig = self._store.rig = rig
+        if rig is not self._store.rig:
+            self._store.rig = rig
             self._observer = PlaceObserver(rig, self._config)
 
     def _may(self, earlier: int) -> bool:

@@ -22,8 +22,8 @@ from graphvio.monocular.structure import (
     PRIOR_INVERSE_DEPTH,
     Eliminated,
     Structure,
-    inverse3,
 )
+from graphvio.self_calibration.bundle import inverse3
 from graphvio.self_calibration.parameters import CAMERA, SINGLE
 
 _ERROR2_BEHIND = 1e6  # of a landmark behind the camera

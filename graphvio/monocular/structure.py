@@ -20,7 +20,7 @@ from graphvio.monocular.reprojection import (
     have_moved,
     whiten_view,
 )
-from graphvio.self_calibration.bundle import rows_of
+from graphvio.self_calibration.bundle import inverse3, rows_of
 from graphvio.self_calibration.parameters import CAMERA
 
 PRIOR_INVERSE_DEPTH = 0.2
@@ -74,18 +74,6 @@ class Eliminated(NamedTuple):
         n = len(structure.odom_T_landmark)
         by_pose = np.zeros((len(structure.state), 3, POSE))
         return Eliminated(np.zeros((n, 3, 3)), np.zeros((n, 3)), by_pose, np.zeros((n, 3, n_calibration)))
-
-
-@kernel
-def inverse3(m: Float, out: Float) -> None:
-    """Invert a symmetric matrix (3, 3), given by its upper triangle."""
-    a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
-    x, y, z = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * x + b * y + c * z
-    out[0, 0], out[0, 1], out[0, 2] = x / determinant, y / determinant, z / determinant
-    out[1, 1], out[1, 2] = (a * f - c * c) / determinant, (b * c - a * e) / determinant
-    out[2, 2] = (a * d - b * b) / determinant
-    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
 
 
 @kernel

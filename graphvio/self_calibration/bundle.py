@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.kernels import kernel, put, vector_kernel
+from graphvio.kernels import kernel, vector_kernel
 from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, POINT, POINT_AT, POSE, new_scratch, observe
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
@@ -223,7 +223,8 @@ def _eliminate(
         eliminated: output; it has the landmark's couplings with the poses.
     """
     first, last = tracks.rows[point], tracks.rows[point + 1]
-    v, bl, vb, vwc = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros((3, PAIR))
+    v, vb, vwc = np.zeros((3, 3)), np.zeros(3), np.zeros((3, PAIR))
+    inverse, bl = eliminated.inverse[point], eliminated.gradient[point]
     t0, t1, t2 = of_poses[0], of_poses[1], of_poses[2]
     wc = eliminated.by_calibration[point]
     for c in range(PAIR):
@@ -234,13 +235,8 @@ def _eliminate(
         bl[c] = totals[PAIR + c, ERROR_AT]
         for d in range(c, 3):
             v[c, d] = totals[PAIR + c, POINT_AT + d]
-    for c in range(3):
         v[c, c] = v[c, c] * (1.0 + damping) + 1e-9
-        for d in range(c):
-            v[c, d] = v[d, c]
-    inverse = _inverse3(v)
-    put(eliminated.inverse[point], inverse)
-    put(eliminated.gradient[point], bl)
+    inverse3(v, inverse)
     for r in range(3):
         vb[r] = inverse[r, 0] * bl[0] + inverse[r, 1] * bl[1] + inverse[r, 2] * bl[2]
         for c in range(PAIR):
@@ -280,9 +276,8 @@ def _lines(rows: Float) -> tuple[Float, Float, Float, Float]:
 
 
 @kernel
-def _inverse3(m: Float) -> Float:
-    """Invert a symmetric matrix (3, 3)."""
-    out = np.empty((3, 3))
+def inverse3(m: Float, out: Float) -> None:
+    """Invert a symmetric matrix (3, 3), given by its upper triangle."""
     a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
     x, y, z = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * x + b * y + c * z
@@ -290,7 +285,6 @@ def _inverse3(m: Float) -> Float:
     out[1, 1], out[1, 2] = (a * f - c * c) / determinant, (b * c - a * e) / determinant
     out[2, 2] = (a * d - b * b) / determinant
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
-    return out
 
 
 @kernel
