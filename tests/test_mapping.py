@@ -17,7 +17,7 @@ from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float
 from graphvio.errors import MapError
-from graphvio.geometry import se3_inverse, se3_log
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.mapping import saved_map
 from graphvio.mapping.mapper import Mapper
 from graphvio.rig import Rig
@@ -122,9 +122,52 @@ def test_places_are_seen_with_the_calibration_of_their_keyframe(made: Made, tmp_
     np.testing.assert_allclose(saved.left2_T_left1(), walk.rig.left2_T_left1(), atol=1e-9)
 
 
+class CalibratedLater(SyntheticFrontEnd):
+    """Has a rig file in which all cameras are turned in body; the true rig is in force from the first second on."""
+
+    TURN = se3_exp(np.array([0.01, -0.006, 0.015, 0.004, -0.002, 0.003]))
+    CORRECTED_AT = 6
+
+    def __init__(self, rig: Rig, *others: Any) -> None:
+        turned = rig.with_cameras(lambda camera: replace(camera, body_T_cam=self.TURN @ camera.body_T_cam))
+        super().__init__(turned, *others)
+        self._true_rig = rig
+
+    def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
+        for each in super().keyframes(from_id):
+            now, before = self.true_T_body(each.id), self.true_T_body(each.id - 1)
+            motion, covariance = each.previous_T_body, each.relative_covariance
+            if motion is not None and covariance is not None:
+                adjoint = se3_adjoint(se3_inverse(now))
+                motion, covariance = se3_inverse(before) @ motion @ now, adjoint @ covariance @ adjoint.T
+            yield replace(
+                each,
+                odom_T_body=each.odom_T_body @ now,
+                previous_T_body=motion,
+                relative_covariance=covariance,
+                calibrated_rig=None if each.id < self.CORRECTED_AT else self._true_rig,
+            )
+
+    def true_T_body(self, number: int) -> Float:
+        return np.eye(4) if number >= self.CORRECTED_AT else se3_inverse(self.TURN)
+
+
+def test_places_from_before_a_correction_of_the_calibration_close_loops(made: Made, tmp_path: Path) -> None:
+    walk, _ = front_end(0, 240, seed=1, kind=CalibratedLater)
+    assert isinstance(walk, CalibratedLater)
+    mapper = mapped(walk, save=tmp_path / "room")
+    found, expected = mapper.trajectory, made.mapper.trajectory
+    by_true_rig = [pose @ se3_inverse(walk.true_T_body(k)) for k, pose in enumerate(found.nav_T_body)]
+    np.testing.assert_allclose(by_true_rig, expected.nav_T_body, atol=2e-4)
+    assert count(mapper, "closures_used") == count(made.mapper, "closures_used")
+    saved = saved_map.load(tmp_path / "room", walk.rig)
+    np.testing.assert_array_equal(saved.body_T_camera[0], walk.rig.pairs[0].left.body_T_cam)
+    np.testing.assert_array_equal(saved.body_T_camera[-1], made.front_end.rig.pairs[0].left.body_T_cam)
+
+
 def test_saved_map_is_complete(made: Made) -> None:
     header = json.loads((made.folder / "map.json").read_text())
-    assert (header["format"], header["version"]) == ("graphvio map", 2)
+    assert (header["format"], header["version"]) == ("graphvio map", 3)
     assert header["places"] == made.mapper.summary()["places"]
     assert {path.name for path in made.folder.parent.iterdir()} == {"room"}  # nothing unfinished is left
 
@@ -214,7 +257,7 @@ def test_folder_without_a_map_raises(copied: Path, tmp_path: Path) -> None:
         Mapper(walk, CONFIG, tmp_path)
     header = json.loads((copied / "map.json").read_text())
     (copied / "map.json").write_text(json.dumps(header | {"version": 99}))
-    with pytest.raises(MapError, match="of version 99, this graphvio reads 2"):
+    with pytest.raises(MapError, match="of version 99, this graphvio reads 3"):
         Mapper(walk, CONFIG, copied)
     (copied / "map.json").write_text("{")
     with pytest.raises(MapError, match=r"map.json: is damaged"):

@@ -18,6 +18,8 @@ from graphvio.odometry.nav_frame import NavFrame
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.window import Keyframe
 from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.slam import FrontEnd
+from graphvio.slam.keyframe import Keyframe as SlamKeyframe
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
@@ -108,6 +110,8 @@ def test_path_with_a_wrong_attitude_of_the_cameras_in_body_does_not_bend(
     truth = load_trajectory(exact.truth)
     written = draw(exact.rig, CalibrationError.of_level(3, ["cameras-in-body"]), seed).written_rig
     odometry = Odometry(written)
+    front_end, keyframes = FrontEnd(odometry), list[SlamKeyframe]()
+    front_end.on_keyframe(keyframes.append)
     estimates = [each for each in map(odometry.process, open_source(walk, written)) if each is not None]
     estimates += odometry.finish()
     refined = odometry.refined_rig
@@ -126,3 +130,9 @@ def test_path_with_a_wrong_attitude_of_the_cameras_in_body_does_not_bend(
     )
     np.testing.assert_allclose(steps, true_steps, atol=0.003)  # positions go on
     assert evaluate(estimated, truth).ate_position_m.rmse < max_error_m
+    chain = [keyframes[0].odom_T_body]
+    for each in keyframes[1:]:
+        assert each.previous_T_body is not None
+        chain.append(chain[-1] @ each.previous_T_body)
+    chained = Trajectory(np.array([each.stamp_ns for each in keyframes]), np.array(chain))
+    assert evaluate(chained, truth).ate_position_m.rmse < max_error_m

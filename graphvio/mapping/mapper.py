@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import numpy as np
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
+from graphvio.geometry import se3_inverse
 from graphvio.mapping import saved_map
 from graphvio.mapping.intake import Intake
 from graphvio.mapping.places import NewPlace, spread_keyframes
@@ -70,10 +72,12 @@ class Mapper:
         self._graph = PoseGraph(settings.loop_probability)
         self._recognition = Recognition(self._config.motion.seed)
         self._places: list[Place] = []
+        self._body_T_camera: list[Float] = []  # of the first camera, by the rig that was in force at each place
         if folder is not None:
             kept = saved_map.load(folder, self._front_end.rig)
             copy_database(folder / DATABASE, self._folder / DATABASE)
             self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
+            self._body_T_camera = list(kept.body_T_camera)
         self._first = len(self._places)  # first place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._front_end.rig)
@@ -129,7 +133,7 @@ class Mapper:
             MapError: If the folder contains other files, or cannot be written.
         """
         with self._working, self._lock:
-            kept = saved_map.to_saved(self._graph, self._recognition, self._places)
+            kept = saved_map.to_saved(self._graph, self._recognition, self._places, self._body_T_camera)
             saved_map.save(kept, self._store, self._front_end.rig, Path(folder))
 
     @property
@@ -190,6 +194,7 @@ class Mapper:
             self._recognition.add({j: each.descriptors for j, each in seen.items()})
         with self._lock:
             self._places.append(Place(self._session, number, keyframe.stamp_ns))
+            self._body_T_camera.append(_body_T_camera(self._store.rig))
             self._keyframe_ids.append(keyframe.id)
             # The graph comes last: after an interruption, the places that it contains are saved.
             if new.previous_T_body is None or new.covariance is None:
@@ -240,7 +245,18 @@ class Mapper:
         stored = self._store.view(self._name(one.session), one.stamp_ns)
         neighbours = partial(self._neighbours, earlier)
         found = verified(stored, view, tried, self._observer.pairs, self._config, seed, neighbours)
-        return None if found is None else closure_of(one, self._places[later], found)
+        if found is None:
+            return None
+        closure = closure_of(one, self._places[later], found)
+        return replace(closure, reference_T_current=self._body_T_body_now(earlier) @ closure.reference_T_current)
+
+    def _body_T_body_now(self, place: int) -> Float:
+        """Return body by the rig that is in force now (4, 4) in body as it was in force at a place.
+
+        Poses of places are by the calibration of then, and what is measured between places is by that of now. What
+        stays is where the cameras were.
+        """
+        return np.asarray(self._body_T_camera[place] @ se3_inverse(_body_T_camera(self._store.rig)))
 
     def _neighbours(self, number: int) -> list[tuple[View, PlaceMotion]]:
         """Return the places next to a place in its chain, and the motions to them."""
@@ -250,7 +266,9 @@ class Mapper:
             if 0 <= other < len(chains) and chains.fragment(other) == chains.fragment(number):
                 place = self._places[other]
                 view = self._store.view(self._name(place.session), place.stamp_ns)
-                found.append((view, PlaceMotion(*chains.motion(number, other))))
+                motion, covariance = chains.motion(number, other)
+                motion = se3_inverse(self._body_T_body_now(number)) @ motion @ self._body_T_body_now(other)
+                found.append((view, PlaceMotion(motion, covariance)))
         return found
 
     def _close_loops(self, found: list[LoopClosure], number: int) -> None:
@@ -279,6 +297,11 @@ class Mapper:
     @staticmethod
     def _name(session: int) -> str:
         return f"session{session}"
+
+
+def _body_T_camera(rig: Rig) -> Float:
+    """Return the place (4, 4) of a rig's first camera, relative to which those of the others are known."""
+    return rig.groups[0].left.body_T_cam
 
 
 class _StageTimes:

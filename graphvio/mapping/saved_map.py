@@ -31,7 +31,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.version import __version__
 
-FORMAT, VERSION = "graphvio map", 2
+FORMAT, VERSION = "graphvio map", 3
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
 _DIGESTED = (_PLACES, _CLOSURES, DATABASE)
 _OWN = (_HEADER, _RIG, *_DIGESTED)
@@ -47,6 +47,7 @@ class SavedMap:
         session: (N,) number of each place's session.
         stamp_ns: (N,) stamps.
         map_T_body: (N, 4, 4) poses, each in its component's frame.
+        body_T_camera: (N, 4, 4) of the first camera in body, as it was calibrated when the place was seen.
         covariance: (N, 6, 6) of the poses, tangent ``[rotation, translation]`` in body.
         first_places: (F,) first place of each fragment.
         component: (F,) the fragment in whose frame each fragment is; 0 is the map's.
@@ -66,6 +67,7 @@ class SavedMap:
     session: Int
     stamp_ns: Int
     map_T_body: Float
+    body_T_camera: Float
     covariance: Float
     first_places: Int
     component: Int
@@ -146,7 +148,9 @@ def check_target(folder: Path) -> None:
         raise MapError(f"{folder}: contains other files than a map; name another folder")
 
 
-def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]) -> SavedMap:
+def to_saved(
+    graph: PoseGraph, recognition: Recognition, places: Sequence[Place], body_T_camera: Sequence[Float]
+) -> SavedMap:
     """Return the map with the places that the graph contains."""
     chains, closures, n = graph.chains, graph.closures, len(graph)
     pairs = [recognition.pairs(place) for place in range(n)]
@@ -155,6 +159,7 @@ def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]
         session=np.array([place.session for place in places[:n]], dtype=np.int64),
         stamp_ns=np.array([place.stamp_ns for place in places[:n]], dtype=np.int64),
         map_T_body=np.array([graph.pose(k) for k in range(n)]).reshape(-1, 4, 4),
+        body_T_camera=np.array(body_T_camera[:n]).reshape(-1, 4, 4),
         covariance=np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
         first_places=np.array(chains.first_places, dtype=np.int64),
         component=np.array(graph.component, dtype=np.int64),

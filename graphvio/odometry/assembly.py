@@ -89,7 +89,7 @@ def estimate_of(
 
 
 def keyframe_of(
-    frameset: FrameSet, frontend: VisualFrontend, estimator: StateEstimator, previous_ns: int | None
+    frameset: FrameSet, frontend: VisualFrontend, estimator: StateEstimator, nav: NavFrame, previous_ns: int | None
 ) -> NewKeyframe:
     """Return the data of a frameset from which later motions are measured.
 
@@ -97,13 +97,16 @@ def keyframe_of(
         frameset: The newest frameset.
         frontend: Has tracked it.
         estimator: Has been updated by it.
+        nav: Frame of the estimates, in which body may have turned since the keyframe before.
         previous_ns: Stamp of the keyframe before, or None.
     """
     previous_T_body = covariance = None
     if previous_ns is not None:
         body_T_previous, covariance = estimator.motion_since(previous_ns), estimator.covariance_since(previous_ns)
         if body_T_previous is not None and covariance is not None:
-            previous_T_body = se3_inverse(body_T_previous)
+            estimator_T_body = estimator.state().nav_T_body
+            nav_T_previous = nav.pose(previous_ns, estimator_T_body @ body_T_previous)
+            previous_T_body = se3_inverse(nav_T_previous) @ nav.pose(frameset.stamp_ns, estimator_T_body)
         else:
             covariance = None
     return NewKeyframe(

@@ -393,7 +393,7 @@ class Odometry:
         )
         references, keyframe = self._frontend.reference_stamps_ns, None
         if frameset.stamp_ns in references:
-            keyframe = keyframe_of(frameset, self._frontend, estimator, self._keyframe_ns)
+            keyframe = keyframe_of(frameset, self._frontend, estimator, self._nav, self._keyframe_ns)
             self._keyframe_ns = frameset.stamp_ns
         candidate = visual.motion if visual.quality is Quality.GOOD else None
         step = Step(

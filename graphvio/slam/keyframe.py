@@ -64,8 +64,9 @@ class Keyframe:
         landmarks: Landmarks of all pairs and single cameras in the frameset.
         images: Index in `graphvio.rig.Rig.groups` -> (left, right) of a pair or (image,) of a single camera, uint8;
             empty unless requested.
-        calibrated_rig: The rig as the self-calibration knew it then, of which the landmarks are; None while the
-            front-end's own, that of the rig file, is in force.
+        calibrated_rig: The rig as the self-calibration knew it then, of which landmarks and body are; None while the
+            front-end's own, that of the rig file, is in force. Where it differs from the previous keyframe's,
+            ``previous_T_body`` leads from body as it was known there to body as it is known here.
     """
 
     id: int
