@@ -103,6 +103,23 @@ class ImuBuffer:
         interval = self.interval(int(stamps[0]), int(stamps[-1])) if len(stamps) > 1 else None
         return None if interval is None else (interval, int(stamps[0]))
 
+    def mean_readings(self, begins_ns: Int, ends_ns: Int) -> Float:
+        """Return mean angular rates and specific forces (N, 6) in intervals (N,), NaN in those that are not covered."""
+        stamps = self._stamps[self._first : self._end]
+        if len(stamps) < 2:
+            return np.full((len(begins_ns), 6), np.nan)
+        steps_ns = np.diff(stamps)
+        values, seconds = self._values[self._first : self._end], steps_ns[:, None] * 1e-9
+        sums = np.vstack([np.zeros(6), np.cumsum(0.5 * (values[1:] + values[:-1]) * seconds, axis=0)])
+        gaps = np.concatenate([[0], np.cumsum(steps_ns > self._max_gap_ns)])  # until each sample
+        at = [np.column_stack([np.interp(ns, stamps, column) for column in sums.T]) for ns in (begins_ns, ends_ns)]
+        first = np.searchsorted(stamps, begins_ns, "right") - 1
+        last = np.searchsorted(stamps, ends_ns, "left")
+        is_covered = (first >= 0) & (last < len(stamps))
+        first, last = np.maximum(first, 0), np.minimum(last, len(stamps) - 1)
+        is_covered &= gaps[first] == gaps[last]
+        return np.where(is_covered[:, None], (at[1] - at[0]) / ((ends_ns - begins_ns)[:, None] * 1e-9), np.nan)
+
     def since(self, stamp_ns: int) -> tuple[Int, Float]:
         """Return the IMU at an instant, interpolated, and its samples after it.
 

@@ -143,6 +143,19 @@ def from_vision(
     return _reinitialised(motion.stamp_ns, state, covariance, gravity_covariance, gyro_bias_sigma)
 
 
+def with_unknown_imu(motion: RelativeMotion, state: RigState, covariance: StateCovariance) -> InitialState:
+    """Reinitialise at the present pose for an IMU whose errors are not known, nor by it where gravity points.
+
+    Args:
+        motion: By vision, that ends in the state.
+        state: The newest one.
+        covariance: Of that.
+    """
+    state = replace(_with_velocity(state, motion), gyro_bias=np.zeros(3), accel_bias=np.zeros(3))
+    initial = with_wide_attitude(_reinitialised(motion.stamp_ns, state, covariance.pose, covariance.gravity))
+    return replace(initial, is_known=True)
+
+
 def with_wide_attitude(initial: InitialState) -> InitialState:
     """Return the first state of an epoch with gravity and gyro bias as uncertain as at a first initialisation.
 

@@ -17,6 +17,7 @@ from graphvio.backend.initial_state import (
     first_state_at,
     from_vision,
     with_free_gravity,
+    with_unknown_imu,
     with_wide_attitude,
 )
 from graphvio.backend.smoother import Smoother
@@ -195,6 +196,18 @@ class SmootherEstimator:
             lambda: missing_of(self.covariance, self._config.initialisation),
         )
         return StateUpdate(status, needs_keyframe=is_rebuilt)
+
+    def forget_imu(self, motion: RelativeMotion) -> None:
+        """Take IMU errors and gravity to be unknown from now on, since the IMU so far has not been right.
+
+        Args:
+            motion: By vision, that ends in the newest state.
+        """
+        try:
+            initial = with_unknown_imu(motion, self.state(), self.covariance)
+            self._reinitialise(initial, self.latest_ns - 1)
+        except SOLVER_ERRORS as error:
+            self._rebuild(self.latest_ns, self.state(), error)
 
     # ------------------------------------------------------------------ measurement update
 

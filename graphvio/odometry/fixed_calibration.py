@@ -32,6 +32,9 @@ class FixedCalibration:
     def add_sample(self, sample: ImuSample) -> None:
         """Leave the sample."""
 
+    def restart_imu(self) -> None:
+        """Do nothing: there are no windows with samples."""
+
     def with_allowance(self, visual: VisualResult) -> VisualResult:
         """Return what vision measured, as it is."""
         return visual

@@ -8,10 +8,13 @@ import numpy as np
 
 from graphvio.backend.estimator import StateEstimator
 from graphvio.backend.initialisation import shows_standstill
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import VisualResult
+from graphvio.odometry.imu_watch import ImuWatch
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
@@ -40,8 +43,39 @@ class ImuOfFramesets:
         self._synchroniser = synchroniser
         self._estimator = estimator
         self._report = report
+        self._watch: ImuWatch | None = None
+        if rig.imu is not None and isinstance(estimator, SmootherEstimator):
+            self._watch = ImuWatch(
+                config.smoother.max_gated_s, config.timing.max_imu_wait_ms * 1e-3, synchroniser, report
+            )
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._first_ns: int | None = None
+
+    @property
+    def is_left_out(self) -> bool:
+        """Whether the IMU is left out, see `ImuWatch`."""
+        return self._watch is not None and self._watch.is_left_out
+
+    def watch(self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult) -> bool:
+        """Leave the IMU out while it contradicts vision.
+
+        Args:
+            stamp_ns: Stamp of a frameset, by which the state has been updated.
+            interval: The IMU before it that has been used, or None.
+            visual: What vision measured there.
+
+        Returns:
+            Whether it is left out from now on, used again, or by another clock.
+        """
+        if self._watch is None:
+            return False
+        assert isinstance(self._estimator, SmootherEstimator)
+        was_left_out = self.is_left_out
+        gate_result = None if interval is None else self._estimator.gate_results.get("vision")
+        is_new = self._watch.update(stamp_ns, visual, gate_result)
+        if is_new and visual.motion is not None:
+            self._estimator.forget_imu(visual.motion)
+        return is_new or self.is_left_out != was_left_out
 
     def is_awaited(self, stamp_ns: int) -> bool:
         """Whether the IMU's first sample is still awaited, without which there is nothing to initialise from."""
@@ -59,8 +93,8 @@ class ImuOfFramesets:
         return not self._estimator.is_initialised or self._synchroniser.initial_interval(stamp_ns) is not None
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two framesets, or None where it does not cover them."""
-        if not self._estimator.has_imu:
+        """Return the IMU between two framesets, or None where it does not cover them, or is left out."""
+        if not self._estimator.has_imu or self.is_left_out:
             return None
         interval = self._synchroniser.interval(start_ns, end_ns)
         if interval is None:
@@ -73,7 +107,7 @@ class ImuOfFramesets:
 
     def readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
         """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""
-        if not self._readout_ns or not self._estimator.has_imu:
+        if not self._readout_ns or not self._estimator.has_imu or self.is_left_out:
             return None
         interval = self._synchroniser.interval(stamp_ns, stamp_ns + self._readout_ns)
         if interval is None:

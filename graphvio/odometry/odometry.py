@@ -153,6 +153,8 @@ class Odometry:
             if self.rig.imu is not None and self.rig.imu.has_matrices:
                 measurement = calibrated_sample(measurement, self.rig.imu)
             for sample in self._synchroniser.add_sample(measurement):
+                if self._imu.is_left_out:
+                    continue
                 self._calibration.add_sample(sample)
                 corrected = self._synchroniser.corrected(sample)
                 self._estimator.add_sample(*corrected)
@@ -356,6 +358,9 @@ class Odometry:
         if update.needs_keyframe:
             self._frontend.start_keyframe()
         self._frontend.drop(update.outliers)
+        if self._imu.watch(stamp_ns, predicted.interval, visual):
+            self._frontend.start_keyframe()
+            self._calibration.restart_imu()
         self._synchroniser.forget_before(stamp_ns)
         self._time_offset.update(stamp_ns, visual)
         return update.status
@@ -419,7 +424,8 @@ class Odometry:
             self._propagator.forget()
             return
         estimator, rate = self._estimator, self._estimator.latest_rate()
-        samples = self._synchroniser.samples_since(stamp_ns) if estimator.has_imu else NO_SAMPLES
+        has_imu = estimator.has_imu and not self._imu.is_left_out
+        samples = self._synchroniser.samples_since(stamp_ns) if has_imu else NO_SAMPLES
         self._propagator.restart(
             stamp_ns,
             self._nav.state(estimator.state()),

@@ -46,6 +46,9 @@ class OnlineCalibration(Protocol):
             sample: As it was measured, by the rig file's scale and axes and on the IMU's clock; not yet corrected.
         """
 
+    def restart_imu(self) -> None:
+        """Forget the IMU samples until now: the IMU is left out, or those that follow are of another clock."""
+
     def with_allowance(self, visual: VisualResult) -> VisualResult:
         """Return what vision measured, with what innovation tests allow for errors of the calibration.
 

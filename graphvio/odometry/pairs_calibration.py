@@ -91,6 +91,10 @@ class PairsCalibration:
             self._averaged += 1
             self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
 
+    def restart_imu(self) -> None:
+        """Leave the window that has samples of before."""
+        self._calibration.start_window()
+
     def with_allowance(self, visual: VisualResult) -> VisualResult:
         """Return motions with what errors of the calibration make them contradict the IMU by."""
         return visual if self._allowance is None else self._allowance.allow(visual, self._estimator)

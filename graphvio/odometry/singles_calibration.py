@@ -78,6 +78,9 @@ class SinglesCalibration:
         if self._on_full_window is not None:
             self._collector.add_sample(sample)
 
+    def restart_imu(self) -> None:
+        """Do nothing: there are no windows with samples."""
+
     def with_allowance(self, visual: VisualResult) -> VisualResult:
         """Return what vision measured, as it is: the window allows for errors of the calibration."""
         return visual

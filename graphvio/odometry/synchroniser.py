@@ -17,6 +17,7 @@ from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_correction import ImuCorrection
 
+_KEPT_NS = 6_000_000_000  # of the IMU, for `Synchroniser.mean_readings`
 _MIN_INTERVAL_NS = 1_000_000  # framesets that are closer are of one instant
 _MAX_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
 _MAX_JUMP_NS = 5_000_000_000
@@ -49,6 +50,7 @@ class Synchroniser:
         self._pairs = len(rig.groups)
         self._has_imu = rig.imu is not None
         self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
+        self._clock_ns = 0  # by which the IMU's stamps are taken to be earlier than they come
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._timing = config.timing
         self._initialisation = config.initialisation
@@ -61,7 +63,9 @@ class Synchroniser:
         self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
-        """Take an IMU sample, and return the samples that are usable now, as they were measured."""
+        """Take an IMU sample, and return those that are usable now, as they were measured but for their clock."""
+        if self._clock_ns:
+            sample = replace(sample, stamp_ns=sample.stamp_ns - self._clock_ns)
         usable = []
         for confirmed in self._sample_jumps.confirm(sample):
             fault = self._imu.add(confirmed)
@@ -164,6 +168,24 @@ class Synchroniser:
                 return self.imu_correction.applied_to(interval), (at_ns - found[1]) * 1e-9
         return None
 
+    def mean_readings(self, begins_ns: Int, ends_ns: Int) -> Float:
+        """Return mean readings (N, 6), not corrected, between framesets' stamps (N,), NaN where they are missing."""
+        return self._imu.mean_readings(begins_ns + self._offset_ns, ends_ns + self._offset_ns)
+
+    def shift_clock(self, seconds: float) -> None:
+        """Take the stamps of samples that come from now on to be late by so many seconds more; older ones are dropped.
+
+        In contrast to `shift_imu`, this is for a clock that has jumped, or is off by more than a calibration.
+        """
+        self._clock_ns += round(seconds * 1e9)
+        self._imu = ImuBuffer(self._timing.max_imu_gap_ms)
+        self._sample_jumps = JumpGuard(EventKind.IMU_FUTURE_STAMP, self._report)
+
+    @property
+    def clock_shift_s(self) -> float:
+        """How late the IMU's clock has been found to be, which `time_offset_s` does not contain."""
+        return self._clock_ns * 1e-9
+
     def shift_imu(self, seconds: float) -> None:
         """Add a correction, seconds, to the offset of the IMU's stamps from the framesets'."""
         self._offset_ns += round(seconds * 1e9)
@@ -181,7 +203,8 @@ class Synchroniser:
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples that are older than an initialisation at this frameset's stamp would need."""
-        self._imu.discard_before(stamp_ns + self._offset_ns - round(self._initialisation.window_s * 1e9))
+        kept_ns = max(round(self._initialisation.window_s * 1e9), _KEPT_NS)
+        self._imu.discard_before(stamp_ns + self._offset_ns - kept_ns)
 
     def _is_due(self, frameset: FrameSet, initialised: bool) -> bool:
         if not self._has_imu or self._imu.oldest_ns is None:

@@ -79,6 +79,7 @@ class WindowCollector:
     def restart(self) -> None:
         """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
         self.keyframes, self._last = [], None
+        self._samples.clear()
 
     def samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
         """Return the IMU over a window, or None where there is none; older samples are forgotten."""

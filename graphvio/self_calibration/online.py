@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.errors import RigError
 from graphvio.kernels import await_compilers
 from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
@@ -186,6 +187,8 @@ class SelfCalibration:
             adjusted = pending.result()
         except np.linalg.LinAlgError:
             return False  # measurements that determine nothing
+        except RigError:
+            return False  # an IMU that is no IMU of any rig: its measurements are wrong
         prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
         if self.has_full_window and not prior.is_confirmed_by(solution.calibration):
             self._refuse(is_full)
@@ -293,6 +296,7 @@ class SelfCalibration:
         covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n_cameras, :n_cameras]
         extrinsics = {}
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
+        _ = estimate.rig  # raises where there is no such rig
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
             extrinsics = extrinsic_covariances(self._rig, anywhere)

@@ -1,0 +1,111 @@
+"""Whether an IMU moves as the cameras do, by rotations and accelerations over some seconds of vision.
+
+The mean difference between angular rates is the gyro's bias, so that only their changes can show an agreement. What
+specific forces have beyond the cameras' accelerations must be gravity: one vector of known norm in a frame that stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.geometry import so3_log
+from graphvio.measurements.sensors import GRAVITY_M_S2
+
+_MIN_STEPS = 20
+_MIN_COVERED_S = 2.0
+_SHIFT_STEP_S = 0.005
+_LOBE_S = 0.1  # shifts that are closer are of the same minimum
+_DISTINCT = 2.0  # times the least difference that all other shifts must have
+_MIN_CHANGE_RAD_S = 0.1  # of the rates, RMS about their mean: less does not tell one shift from another
+_RATE_NOISE_RAD_S = 0.02
+_FORCE_NOISE_M_S2 = 0.5  # and bias
+_ERROR_SHARE = 0.1  # of the change: errors of the calibration, and of means over a step
+_MAX_GRAVITY_ERROR_M_S2 = 1.0
+
+
+class VisualStep(NamedTuple):
+    """A motion by vision between two successive framesets."""
+
+    begin_ns: int
+    end_ns: int
+    begin_T_end: Float  # (4, 4) of body
+
+
+Readings = Callable[[Int, Int], Float]
+"""Returns the IMU's mean readings (N, 6) between stamps (N,) and (N,): rad/s and m/s^2; NaN where samples are missing.
+"""
+
+
+def matching_shift(steps: Sequence[VisualStep], readings: Readings, max_shift_s: float) -> float | None:
+    """Find the only shift of its stamps at which the IMU moves as the cameras do.
+
+    Args:
+        steps: By vision, each beginning where the one before ends.
+        readings: Of the IMU.
+        max_shift_s: Largest shift that is tried, either way.
+
+    Returns:
+        By how many seconds the IMU's stamps are late; None where there is no such shift, where less than 2 s of vision
+        and IMU are known there, or the rig does not turn.
+    """
+    if not steps:
+        return None
+    begins_ns, ends_ns = (np.array([each[at] for each in steps], dtype=np.int64) for at in (0, 1))
+    durations_s = (ends_ns - begins_ns) * 1e-9
+    turns = np.array([so3_log(np.ascontiguousarray(each.begin_T_end[:3, :3])) for each in steps])
+    rates = turns / durations_s[:, None]
+    count = round(max_shift_s / _SHIFT_STEP_S)
+    shifts, differences, changes = np.arange(-count, count + 1) * _SHIFT_STEP_S, [], []
+    for shift_ns in np.rint(shifts * 1e9).astype(np.int64).tolist():
+        by_gyro = readings(begins_ns + shift_ns, ends_ns + shift_ns)[:, :3]
+        known = np.flatnonzero(~np.isnan(by_gyro).any(axis=1))
+        is_enough = len(known) >= _MIN_STEPS and durations_s[known].sum() >= _MIN_COVERED_S
+        differences.append(_spread(by_gyro[known] - rates[known]) if is_enough else np.inf)
+        changes.append(_spread(rates[known]) if is_enough else 0.0)
+    best = int(np.argmin(differences))
+    least, change = differences[best], changes[best]
+    if not 0 < best < 2 * count or change < _MIN_CHANGE_RAD_S or least > _RATE_NOISE_RAD_S + _ERROR_SHARE * change:
+        return None
+    others: Bool = np.abs(shifts - shifts[best]) > _LOBE_S
+    if (np.array(differences)[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
+        return None
+    shift_s = float(shifts[best]) + _beyond(differences[best - 1 : best + 2])
+    return shift_s if _shows_gravity(steps, readings, round(shift_s * 1e9)) else None
+
+
+def _shows_gravity(steps: Sequence[VisualStep], readings: Readings, shift_ns: int) -> bool:
+    """Whether specific forces at a shift are the cameras' accelerations and gravity."""
+    first_R_end, gravity, accelerations = np.eye(3), [], []
+    middles_ns = np.array([(each.begin_ns + each.end_ns) // 2 for each in steps])
+    forces = readings(middles_ns[:-1] + shift_ns, middles_ns[1:] + shift_ns)[:, 3:]
+    for one, other, force in zip(steps[:-1], steps[1:], forces, strict=True):
+        first_R_end = first_R_end @ one.begin_T_end[:3, :3]
+        before, after = (each.begin_T_end[:3, 3] / ((each.end_ns - each.begin_ns) * 1e-9) for each in (one, other))
+        between_s = 0.5e-9 * (other.end_ns - one.begin_ns)
+        acceleration = (after - one.begin_T_end[:3, :3].T @ before) / between_s  # in body between the two steps
+        if not np.isnan(force).any():
+            gravity.append(first_R_end @ (force - acceleration))
+            accelerations.append(acceleration)
+    if len(gravity) < _MIN_STEPS:
+        return False
+    norm, change = float(np.linalg.norm(np.mean(gravity, axis=0))), _spread(np.array(accelerations))
+    return (
+        abs(norm - GRAVITY_M_S2) < _MAX_GRAVITY_ERROR_M_S2
+        and _spread(np.array(gravity)) < _FORCE_NOISE_M_S2 + _ERROR_SHARE * change
+    )
+
+
+def _spread(vectors: Float) -> float:
+    """Return the RMS of vectors (N, 3) about their mean."""
+    return float(np.sqrt(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _beyond(differences: Sequence[float]) -> float:
+    """Return how far from the middle one of three shifts the minimum of the parabola through the squares is."""
+    before, at, after = np.square(differences)
+    curvature = before - 2.0 * at + after
+    return float(0.5 * _SHIFT_STEP_S * (before - after) / curvature) if 0.0 < curvature < np.inf else 0.0

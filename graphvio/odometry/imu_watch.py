@@ -1,0 +1,128 @@
+"""Watches whether the IMU agrees with vision, and leaves it out while it does not.
+
+The innovation test trusts the prediction: where vision is refused for a moment, a crowd or a reflection has misled it.
+An IMU whose clock jumps, or whose axes, units or time offset are not those of the rig, contradicts vision for good, and
+would bend the whole path. When vision of good quality has been refused for so long that the estimator takes it for
+right, the IMU is therefore left out, until it moves as the cameras do. Where it does so at another time, its clock is
+corrected.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from graphvio.backend.imu_match import VisualStep, matching_shift
+from graphvio.geometry import se3_inverse
+from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.odometry.synchroniser import Synchroniser
+
+_COMPARED_NS = 4_000_000_000  # of rotations
+_MAX_STEP_NS = 500_000_000  # between framesets whose rotation is compared
+_CHECK_NS = 1_000_000_000  # from one comparison to the next
+_FIRST_WAIT_NS = 1_000_000_000  # until the first one; four times as long each time
+_MAX_WAIT_NS = 60_000_000_000
+_MAX_SHIFT_S = 1.5
+_MIN_SHIFT_S = 0.005  # less is the calibration's
+
+
+class ImuWatch:
+    """Decides whether the IMU is used, and by which clock.
+
+    Args:
+        max_refused_s: Vision of good quality that is refused for longer, within twice the time, is right.
+        max_late_s: A clock that is later cannot be corrected: framesets do not wait for so long.
+        synchroniser: Has the samples, and takes corrections of their clock.
+        report: Receives events.
+
+    Attributes:
+        is_left_out: Whether the IMU is left out now.
+    """
+
+    def __init__(self, max_refused_s: float, max_late_s: float, synchroniser: Synchroniser, report: Report) -> None:
+        self.is_left_out = False
+        self._max_refused_ns = round(max_refused_s * 1e9)
+        self._max_late_s = max_late_s
+        self._synchroniser = synchroniser
+        self._report = report
+        self._refused: deque[tuple[int, int]] = deque()  # stamp of a frameset, and the time before it if it was refused
+        self._steps: deque[VisualStep] = deque()  # each begins where the one before ends
+        self._before: RelativeMotion | None = None
+        self._before_ns = 0
+        self._since_ns = 0  # first refused motion
+        self._next_ns = 0  # of the next comparison
+        self._wait_ns = _FIRST_WAIT_NS
+
+    def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> bool:
+        """Take a frameset.
+
+        Args:
+            stamp_ns: Its stamp.
+            visual: What vision measured.
+            gate_result: Of the test against a prediction by the IMU; None where there was none.
+
+        Returns:
+            Whether the IMU has changed: it is used again, or by another clock. What is known of its errors no longer
+            holds then.
+        """
+        step_ns, self._before_ns = stamp_ns - self._before_ns, stamp_ns
+        motion = visual.motion if visual.quality is Quality.GOOD else None
+        self._add_step(step_ns, motion)
+        if self.is_left_out:
+            return motion is not None and stamp_ns >= self._next_ns and self._compare(stamp_ns)
+        if motion is not None and gate_result is not None and step_ns < _MAX_STEP_NS:
+            self._refused.append((stamp_ns, 0 if gate_result.accepted else step_ns))
+        while self._refused and stamp_ns - self._refused[0][0] >= 2 * self._max_refused_ns:
+            self._refused.popleft()
+        if sum(refused_ns for _, refused_ns in self._refused) >= self._max_refused_ns:
+            self._leave_out(stamp_ns)
+        return False
+
+    def _leave_out(self, stamp_ns: int) -> None:
+        """Leave the IMU out until the rotations since it was first refused can be compared."""
+        self._since_ns = next(ns for ns, refused_ns in self._refused if refused_ns)
+        self._refused.clear()
+        self.is_left_out, self._next_ns = True, stamp_ns + self._wait_ns
+        self._wait_ns = min(4 * self._wait_ns, _MAX_WAIT_NS)
+        self._report(
+            stamp_ns,
+            EventKind.IMU_LEFT_OUT,
+            "it contradicts good images: is its clock right, and are its axes and units those of the rig?",
+        )
+
+    def _compare(self, stamp_ns: int) -> bool:
+        """Use the IMU again if it moves as the cameras do, now or at another time."""
+        self._next_ns = stamp_ns + _CHECK_NS
+        steps = [step for step in self._steps if step.begin_ns >= self._since_ns]
+        shift_s = matching_shift(steps, self._synchroniser.mean_readings, _MAX_SHIFT_S)
+        if shift_s is None or shift_s > self._max_late_s:
+            return False
+        self.is_left_out = False
+        if abs(shift_s) < _MIN_SHIFT_S:
+            self._report(stamp_ns, EventKind.IMU_USED_AGAIN, "it moves as the cameras do")
+            return True
+        self._synchroniser.shift_clock(shift_s)
+        late = f"{1e3 * abs(shift_s):.0f} ms {'later' if shift_s > 0.0 else 'earlier'}"
+        self._report(
+            stamp_ns,
+            EventKind.IMU_CLOCK_OFF,
+            f"it moves as the cameras do by stamps that are {late}; corrected for this run",
+        )
+        return True
+
+    def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:
+        """Add the motion since the frameset before; where that is not known, what follows is not compared with it."""
+        before, self._before = self._before, motion
+        begin_T_end = None
+        if motion is not None and 0 < step_ns < _MAX_STEP_NS:
+            if motion.reference_stamp_ns == motion.stamp_ns - step_ns:
+                begin_T_end = motion.reference_T_current
+            elif before is not None and before.reference_stamp_ns == motion.reference_stamp_ns:
+                begin_T_end = se3_inverse(before.reference_T_current) @ motion.reference_T_current
+        if motion is None or begin_T_end is None:
+            self._steps.clear()
+            return
+        self._steps.append(VisualStep(motion.stamp_ns - step_ns, motion.stamp_ns, begin_T_end))
+        while motion.stamp_ns - self._steps[0].begin_ns > _COMPARED_NS:
+            self._steps.popleft()
