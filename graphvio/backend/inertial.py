@@ -108,17 +108,18 @@ class ImuBuffer:
         stamps = self._stamps[self._first : self._end]
         if len(stamps) < 2:
             return np.full((len(begins_ns), 6), np.nan)
-        steps_ns = np.diff(stamps)
-        values, seconds = self._values[self._first : self._end], steps_ns[:, None] * 1e-9
-        sums = np.vstack([np.zeros(6), np.cumsum(0.5 * (values[1:] + values[:-1]) * seconds, axis=0)])
+        values, steps_ns = self._values[self._first : self._end], np.diff(stamps)
+        sums = np.vstack([np.zeros(6), np.cumsum(0.5 * (values[1:] + values[:-1]) * steps_ns[:, None], axis=0)])
         gaps = np.concatenate([[0], np.cumsum(steps_ns > self._max_gap_ns)])  # until each sample
-        at = [np.column_stack([np.interp(ns, stamps, column) for column in sums.T]) for ns in (begins_ns, ends_ns)]
-        first = np.searchsorted(stamps, begins_ns, "right") - 1
-        last = np.searchsorted(stamps, ends_ns, "left")
-        is_covered = (first >= 0) & (last < len(stamps))
-        first, last = np.maximum(first, 0), np.minimum(last, len(stamps) - 1)
-        is_covered &= gaps[first] == gaps[last]
-        return np.where(is_covered[:, None], (at[1] - at[0]) / ((ends_ns - begins_ns)[:, None] * 1e-9), np.nan)
+        at = [np.clip(np.searchsorted(stamps, ns, "right") - 1, 0, len(stamps) - 2) for ns in (begins_ns, ends_ns)]
+        totals = []
+        for k, ns in zip(at, (begins_ns, ends_ns), strict=True):
+            after = (ns - stamps[k])[:, None]
+            slope = (values[k + 1] - values[k]) / steps_ns[k][:, None]
+            totals.append(sums[k] + after * (values[k] + 0.5 * after * slope))
+        is_covered = (begins_ns >= stamps[0]) & (ends_ns <= stamps[-1]) & (gaps[at[0]] == gaps[at[1] + 1])
+        means = (totals[1] - totals[0]) / (ends_ns - begins_ns)[:, None]
+        return np.where(is_covered[:, None], means, np.nan)
 
     def since(self, stamp_ns: int) -> tuple[Int, Float]:
         """Return the IMU at an instant, interpolated, and its samples after it.

@@ -59,6 +59,7 @@ class SmootherEstimator:
         self._accepted = 0  # motions since the initialisation
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._imu_failed = False  # since the first of these
+        self._is_imu_left_out = False
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
         self._sigma_m = 0.0  # of the position since vision last constrained it
         self._rebuilt_sigma_m = 0.0  # the same when the window was rebuilt since then
@@ -193,9 +194,13 @@ class SmootherEstimator:
             is_constrained,
             self._sigma_m,
             self.has_imu,
-            lambda: missing_of(self.covariance, self._config.initialisation),
+            lambda: "" if self._is_imu_left_out else missing_of(self.covariance, self._config.initialisation),
         )
         return StateUpdate(status, needs_keyframe=is_rebuilt)
+
+    def leave_imu_out(self) -> None:
+        """Take note that the IMU is left out, until `forget_imu`: nothing more of it will complete the state."""
+        self._is_imu_left_out = True
 
     def forget_imu(self, motion: RelativeMotion) -> None:
         """Take IMU errors and gravity to be unknown from now on, since the IMU so far has not been right.
@@ -203,6 +208,7 @@ class SmootherEstimator:
         Args:
             motion: By vision, that ends in the newest state.
         """
+        self._is_imu_left_out = False
         try:
             initial = with_unknown_imu(motion, self.state(), self.covariance)
             self._reinitialise(initial, self.latest_ns - 1)

@@ -87,6 +87,7 @@ def _document(found: RecordedCalibration) -> dict[str, object]:
             {"group": each.group, "chi_square": each.statistic, "dimension": each.dimension, "agree": each.is_good}
             for each in found.agreements
         ],
+        "remarks": found.remarks,
         "doubts": doubts_of(found),
     }
 
@@ -99,6 +100,8 @@ def _print(found: RecordedCalibration) -> None:
     for row in rows:
         cells = [cell.rjust(width) for cell, width in zip(row[1:-1], widths[1:-1], strict=True)]
         typer.echo("  ".join([row[0].ljust(widths[0]), *cells, row[-1]]).rstrip())
+    for remark in found.remarks:
+        typer.echo(remark)
     agreements = found.agreements
     if agreements:
         worst = max(agreements, key=lambda each: each.statistic / each.dimension)

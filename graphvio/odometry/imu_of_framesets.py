@@ -56,6 +56,11 @@ class ImuOfFramesets:
         """Whether the IMU is left out, see `ImuWatch`."""
         return self._watch is not None and self._watch.is_left_out
 
+    @property
+    def warnings(self) -> list[str]:
+        """Where the IMU contradicts the rig, a sentence each."""
+        return [] if self._watch is None else self._watch.warnings
+
     def watch(self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult) -> bool:
         """Leave the IMU out while it contradicts vision.
 
@@ -75,6 +80,8 @@ class ImuOfFramesets:
         is_new = self._watch.update(stamp_ns, visual, gate_result)
         if is_new and visual.motion is not None:
             self._estimator.forget_imu(visual.motion)
+        if self.is_left_out and not was_left_out:
+            self._estimator.leave_imu_out()
         return is_new or self.is_left_out != was_left_out
 
     def is_awaited(self, stamp_ns: int) -> bool:

@@ -10,28 +10,48 @@ corrected.
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
+from dataclasses import replace
 
 from graphvio.backend.imu_match import VisualStep, matching_shift
+from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
-from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.motion import PairReport, Quality, RelativeMotion, VisualResult
 from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.rig import Rig
 
 _COMPARED_NS = 4_000_000_000  # of rotations
 _MAX_STEP_NS = 500_000_000  # between framesets whose rotation is compared
 _CHECK_NS = 1_000_000_000  # from one comparison to the next
 _FIRST_WAIT_NS = 1_000_000_000  # until the first one; four times as long each time
 _MAX_WAIT_NS = 60_000_000_000
+_MIN_INLIERS = 20
+_MAX_WITNESSES = 2  # pairs that see the same motion: what misleads one of them does not mislead the other
 _MAX_SHIFT_S = 1.5
 _MIN_SHIFT_S = 0.005  # less is the calibration's
+
+
+def with_late_clock(rig: Rig, seconds: float) -> Rig:
+    """Return a rig whose IMU's stamps are so much later; the same one where a rig file cannot say so."""
+    if rig.imu is not None and seconds:
+        with suppress(RigError):
+            return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + seconds))
+    return rig
+
+
+def _bears_out(report: PairReport) -> bool:
+    """Whether most of what a pair sees moves as the motion says."""
+    return report.inliers >= max(_MIN_INLIERS, 0.5 * report.points)
 
 
 class ImuWatch:
     """Decides whether the IMU is used, and by which clock.
 
     Args:
-        max_refused_s: Vision of good quality that is refused for longer, within twice the time, is right.
+        max_refused_s: Vision of good quality that is refused for longer, within twice the time, is right. Where two
+            pairs see the same motion, half of it is enough.
         max_late_s: A clock that is later cannot be corrected: framesets do not wait for so long.
         synchroniser: Has the samples, and takes corrections of their clock.
         report: Receives events.
@@ -46,13 +66,25 @@ class ImuWatch:
         self._max_late_s = max_late_s
         self._synchroniser = synchroniser
         self._report = report
-        self._refused: deque[tuple[int, int]] = deque()  # stamp of a frameset, and the time before it if it was refused
+        self._refused: deque[tuple[int, int]] = deque()  # stamp, and what a refused motion counts, or 0
         self._steps: deque[VisualStep] = deque()  # each begins where the one before ends
         self._before: RelativeMotion | None = None
         self._before_ns = 0
         self._since_ns = 0  # first refused motion
         self._next_ns = 0  # of the next comparison
         self._wait_ns = _FIRST_WAIT_NS
+
+    @property
+    def warnings(self) -> list[str]:
+        """What contradicts the rig, a sentence each."""
+        found, shift_s = [], self._synchroniser.clock_shift_s
+        if shift_s:
+            found.append(
+                f"IMU: its stamps are {1e3 * shift_s:.0f} ms late by the rig's time offset; corrected for this run"
+            )
+        if self.is_left_out:
+            found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
+        return found
 
     def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> bool:
         """Take a frameset.
@@ -72,7 +104,8 @@ class ImuWatch:
         if self.is_left_out:
             return motion is not None and stamp_ns >= self._next_ns and self._compare(stamp_ns)
         if motion is not None and gate_result is not None and step_ns < _MAX_STEP_NS:
-            self._refused.append((stamp_ns, 0 if gate_result.accepted else step_ns))
+            witnesses = min(sum(_bears_out(report) for report in visual.pairs.values()), _MAX_WITNESSES)
+            self._refused.append((stamp_ns, 0 if gate_result.accepted else step_ns * max(witnesses, 1)))
         while self._refused and stamp_ns - self._refused[0][0] >= 2 * self._max_refused_ns:
             self._refused.popleft()
         if sum(refused_ns for _, refused_ns in self._refused) >= self._max_refused_ns:

@@ -30,6 +30,7 @@ from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
 from graphvio.odometry.fixed_calibration import FixedCalibration
 from graphvio.odometry.imu_of_framesets import ImuOfFramesets
+from graphvio.odometry.imu_watch import with_late_clock
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.pairs_calibration import PairsCalibration
@@ -224,9 +225,9 @@ class Odometry:
 
     @property
     def rig_warnings(self) -> list[str]:
-        """Where the motions contradict the rig: a sentence each, with the size and one standard deviation."""
+        """Where the measurements contradict the rig: a sentence each, with the size and what is done about it."""
         off = [f"{finding}; corrected for this run" for finding in self.calibration_findings if finding.is_significant]
-        return self._vision_events.rig_warnings + off
+        return self._vision_events.rig_warnings + off + self._imu.warnings
 
     @property
     def calibration(self) -> CalibrationEstimate | None:
@@ -242,7 +243,12 @@ class Odometry:
     def refined_rig(self) -> Rig | None:
         """The rig with the calibration as it is known now, or None where the calibration is not estimated."""
         estimate = self._calibration.estimate
-        return None if estimate is None else estimate.rig
+        return None if estimate is None else with_late_clock(estimate.rig, self.clock_shift_s)
+
+    @property
+    def clock_shift_s(self) -> float:
+        """By how much the IMU's stamps have been found to be late beyond the rig's time offset, see `ImuWatch`."""
+        return self._synchroniser.clock_shift_s
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Register a function that gets the measurements of each full window of the self-calibration.

@@ -16,6 +16,7 @@ from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
 from graphvio.errors import CalibrationError
 from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.odometry.imu_watch import with_late_clock
 from graphvio.odometry.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.self_calibration.batch import Batch, calibrate_windows, difference_of
@@ -82,6 +83,7 @@ class RecordedCalibration:
         end_ns: stamp of the last frameset.
         is_file_exact: whether the odometry found nothing that speaks against the rig file.
         all_findings: what is known of all parts where none is kept as in the file.
+        clock_shift_s: by how much the IMU's stamps are late beyond what the calibration of its time offset is for.
     """
 
     what: str
@@ -91,11 +93,12 @@ class RecordedCalibration:
     end_ns: int
     is_file_exact: bool
     all_findings: list[Finding]
+    clock_shift_s: float = 0.0
 
     @cached_property
     def rig(self) -> Rig:
         """The calibrated rig with its standard deviations; what was not calibrated is as in the file."""
-        refined = self.batch.estimate.rig
+        refined = with_late_clock(self.batch.estimate.rig, self.clock_shift_s)
         if self.what == "all":
             return refined
         of_file, found = RigCalibration.of(self.file_rig), RigCalibration.of(refined)
@@ -125,6 +128,15 @@ class RecordedCalibration:
         """Parts that are kept as in the file though the recording contradicts it."""
         parts = {found.part for found in self.findings}
         return [found for found in self.all_findings if found.is_significant and found.part not in parts]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What was found beyond the parts of the calibration, a sentence each."""
+        if not self.clock_shift_s:
+            return []
+        return [
+            f"IMU, clock: stamps are {1e3 * self.clock_shift_s:.1f} ms late, beyond the time offset of the rig file"
+        ]
 
     @property
     def is_consistent(self) -> bool:
@@ -199,7 +211,7 @@ def calibrate_recording(
     prior_rig = _with_fixed(rig, _FIXED[what])
     online = odometry.calibration
     assert online is not None, "the configuration asks for it"
-    judged = end_ns, online.is_file_exact, odometry.calibration_findings
+    judged = end_ns, online.is_file_exact, odometry.calibration_findings, odometry.clock_shift_s
     batch = calibrate_windows(prior_rig, windows, online.posterior.mean, lambda k, n: on_progress("all windows", k, n))
     if sum(batch.left_out) > len(windows) // 2:
         raise CalibrationError(

@@ -31,9 +31,9 @@ def calibrated_rig(source: Source, config: Config, on_progress: Progress) -> tup
         found = calibrate_recording(source, source.rig, "all", config, on_progress, compares_halves=False)
     except CalibrationError as error:
         return source.rig, [f"calibration: as in the rig file, since it cannot be estimated: {error}"]
-    if found.is_file_exact:
+    if found.is_file_exact and not found.clock_shift_s:
         return source.rig, ["calibration: as in the rig file, which the recording does not contradict"]
-    return found.rig, described(found.findings)
+    return found.rig, [*described(found.findings), *found.remarks]
 
 
 def session_findings(folder: Path) -> list[str]:

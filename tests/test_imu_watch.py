@@ -1,0 +1,123 @@
+"""An IMU that contradicts good images is left out, and its clock is corrected where that explains it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_walks import recorded
+
+from graphvio import Odometry, open_source
+from graphvio.evaluation import evaluate
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import EventKind
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
+from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
+
+SECONDS = 12.0
+FAULT_S = 4.0  # after the first frameset
+LEFT_OUT, USED_AGAIN, CLOCK_OFF = EventKind.IMU_LEFT_OUT, EventKind.IMU_USED_AGAIN, EventKind.IMU_CLOCK_OFF
+Change = Callable[[ImuSample, float], ImuSample]
+"""A fault: takes a sample, and the time of its stamp since the first frameset, seconds."""
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("watch") / "walk", SECONDS)
+
+
+class Walked:
+    """The odometry at the end of a walk with a fault of the IMU, its events, and its error."""
+
+    def __init__(self, walk: Path, change: Change) -> None:
+        source = open_source(walk)
+        assert source.truth is not None
+        measurements = list(source)
+        first_ns = next(each.stamp_ns for each in measurements if isinstance(each, FrameSet))
+        faulty: list[Measurement] = [
+            change(each, 1e-9 * (each.stamp_ns - first_ns)) if isinstance(each, ImuSample) else each
+            for each in measurements
+        ]
+        faulty.sort(key=lambda each: each.stamp_ns)  # as recordings are
+        self.odometry = Odometry(source.rig)
+        estimates = [each for each in map(self.odometry.process, faulty) if each is not None]
+        estimates += self.odometry.finish()
+        posed = [each for each in estimates if each.nav_T_body is not None]
+        self.epochs = {each.epoch for each in estimates}
+        self.last_status = estimates[-1].status
+        self.events = Counter(event.kind for event in self.odometry.take_events())
+        estimated = Trajectory(
+            np.array([each.stamp_ns for each in posed]), np.array([each.nav_T_body for each in posed])
+        )
+        self.error_m = evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse
+
+
+def late(seconds: float, since_s: float = -np.inf) -> Change:
+    def change(sample: ImuSample, at_s: float) -> ImuSample:
+        return replace(sample, stamp_ns=sample.stamp_ns + round(seconds * 1e9)) if at_s > since_s else sample
+
+    return change
+
+
+@pytest.mark.parametrize("seconds", [0.08, -0.1])
+def test_clock_that_is_off_is_corrected(walk: Path, seconds: float) -> None:
+    walked = Walked(walk, late(seconds))
+    assert (walked.events[LEFT_OUT], walked.events[CLOCK_OFF]) == (1, 1)
+    assert walked.epochs == {0}
+    assert walked.error_m < 0.02
+    rig, refined = walked.odometry.rig, walked.odometry.refined_rig
+    assert rig.imu is not None
+    assert refined is not None
+    assert refined.imu is not None
+    assert refined.imu.time_offset_s - rig.imu.time_offset_s == pytest.approx(seconds, abs=0.002)
+    assert any(f"{1e3 * seconds:.0f} ms" in warning for warning in walked.odometry.rig_warnings)
+
+
+def test_clock_that_jumps_is_corrected(walk: Path) -> None:
+    walked = Walked(walk, late(-0.06, FAULT_S))
+    assert (walked.events[LEFT_OUT], walked.events[CLOCK_OFF]) == (1, 1)
+    assert walked.odometry.clock_shift_s == pytest.approx(-0.06, abs=0.002)
+    assert walked.epochs == {0}
+    assert walked.error_m < 0.02
+
+
+def test_axes_that_are_not_the_rigs_are_left_out(walk: Path) -> None:
+    z90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    walked = Walked(
+        walk,
+        lambda sample, _: replace(
+            sample, angular_velocity=z90 @ sample.angular_velocity, linear_acceleration=z90 @ sample.linear_acceleration
+        ),
+    )
+    assert walked.events[LEFT_OUT] == 1
+    assert not walked.events[USED_AGAIN] + walked.events[CLOCK_OFF]
+    assert walked.odometry.clock_shift_s == 0.0
+    assert walked.last_status is Status.TRACKING
+    assert walked.error_m < 0.05
+    assert any("left out" in warning for warning in walked.odometry.rig_warnings)
+
+
+def test_fault_that_passes_is_left_out_until_then(walk: Path) -> None:
+    """The gyro reads half of its rates for 3 s."""
+    walked = Walked(
+        walk,
+        lambda sample, at_s: (
+            replace(sample, angular_velocity=0.5 * sample.angular_velocity)
+            if FAULT_S < at_s < FAULT_S + 3.0
+            else sample
+        ),
+    )
+    assert (walked.events[LEFT_OUT], walked.events[USED_AGAIN], walked.events[CLOCK_OFF]) == (1, 1, 0)
+    assert walked.error_m < 0.02
+    assert not walked.odometry.rig_warnings
+
+
+def test_imu_that_is_right_is_not_left_out(walk: Path) -> None:
+    walked = Walked(walk, lambda sample, _: sample)
+    assert not walked.events & Counter([LEFT_OUT, USED_AGAIN, CLOCK_OFF])
+    assert walked.odometry.clock_shift_s == 0.0
