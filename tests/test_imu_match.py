@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Float
 from graphvio.backend.imu_match import VisualStep, matching_shift
-from graphvio.backend.inertial import ImuBuffer
+from graphvio.backend.inertial import ImuBuffer, MeanReadings
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 
@@ -45,7 +45,7 @@ def readings(
     late_s: float,
     change: Callable[[Float], Float] = lambda values: values,
     until_s: float = 6.0,
-) -> Callable[[Int, Int], Float]:
+) -> MeanReadings:
     buffer, h = ImuBuffer(50.0), 1e-4
     bias = np.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.08])
     for k in range(-RATE_HZ, round(until_s * RATE_HZ)):
@@ -57,7 +57,7 @@ def readings(
         force = world_R_body.T @ (acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
         values = change(np.concatenate([rate, force])) + bias
         assert not buffer.add(ImuSample(FIRST_NS + round((t + late_s) * 1e9), values[:3], values[3:]))
-    return buffer.mean_readings
+    return buffer.means()
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.002, -0.0137, 0.1, -0.45])
@@ -122,7 +122,7 @@ def test_matching_shift_of_a_turn_that_repeats_is_none() -> None:
                 np.array([1e-3 * t, 2e-3 * t, GRAVITY_M_S2]),
             )
         )
-    assert matching_shift(made, buffer.mean_readings, MAX_SHIFT_S) is None
+    assert matching_shift(made, buffer.means(), MAX_SHIFT_S) is None
 
 
 def test_mean_readings_are_those_of_the_intervals_and_nan_in_gaps() -> None:
@@ -134,10 +134,10 @@ def test_mean_readings_are_those_of_the_intervals_and_nan_in_gaps() -> None:
         np.array([12_345_678, 150_000_000, 310_000_000, 480_000_000]),
         np.array([77_000_000, 320_000_000, 333_000_001, 500_000_000]),
     )
-    found = buffer.mean_readings(begins, ends)
+    found = buffer.means().between(begins, ends)
     for k in (0, 2):
         interval = buffer.interval(int(begins[k]), int(ends[k]))
         assert interval is not None
         np.testing.assert_allclose(found[k], np.concatenate([interval.mean_rate, interval.mean_force]), atol=1e-9)
     assert np.isnan(found[[1, 3]]).all()
-    assert np.isnan(ImuBuffer(50.0).mean_readings(begins, ends)).all()
+    assert np.isnan(ImuBuffer(50.0).means().between(begins, ends)).all()

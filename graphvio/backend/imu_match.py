@@ -6,12 +6,13 @@ specific forces have beyond the cameras' accelerations must be gravity: one vect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Bool, Float
+from graphvio.backend.inertial import MeanReadings
 from graphvio.geometry import so3_log
 from graphvio.measurements.sensors import GRAVITY_M_S2
 
@@ -35,17 +36,12 @@ class VisualStep(NamedTuple):
     begin_T_end: Float  # (4, 4) of body
 
 
-Readings = Callable[[Int, Int], Float]
-"""Returns the IMU's mean readings (N, 6) between stamps (N,) and (N,): rad/s and m/s^2; NaN where samples are missing.
-"""
-
-
-def matching_shift(steps: Sequence[VisualStep], readings: Readings, max_shift_s: float) -> float | None:
+def matching_shift(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> float | None:
     """Find the only shift of its stamps at which the IMU moves as the cameras do.
 
     Args:
         steps: By vision, each beginning where the one before ends.
-        readings: Of the IMU.
+        readings: Of the IMU, by the framesets' clock.
         max_shift_s: Largest shift that is tried, either way.
 
     Returns:
@@ -59,29 +55,30 @@ def matching_shift(steps: Sequence[VisualStep], readings: Readings, max_shift_s:
     turns = np.array([so3_log(np.ascontiguousarray(each.begin_T_end[:3, :3])) for each in steps])
     rates = turns / durations_s[:, None]
     count = round(max_shift_s / _SHIFT_STEP_S)
-    shifts, differences, changes = np.arange(-count, count + 1) * _SHIFT_STEP_S, [], []
-    for shift_ns in np.rint(shifts * 1e9).astype(np.int64).tolist():
-        by_gyro = readings(begins_ns + shift_ns, ends_ns + shift_ns)[:, :3]
-        known = np.flatnonzero(~np.isnan(by_gyro).any(axis=1))
-        is_enough = len(known) >= _MIN_STEPS and durations_s[known].sum() >= _MIN_COVERED_S
-        differences.append(_spread(by_gyro[known] - rates[known]) if is_enough else np.inf)
-        changes.append(_spread(rates[known]) if is_enough else 0.0)
+    shifts = np.arange(-count, count + 1) * _SHIFT_STEP_S
+    shifts_ns = np.rint(shifts * 1e9).astype(np.int64)[:, None]
+    by_gyro = readings.between((begins_ns + shifts_ns).ravel(), (ends_ns + shifts_ns).ravel())[:, :3]
+    by_gyro = by_gyro.reshape(len(shifts), len(steps), 3)
+    is_known = np.asarray(np.isfinite(by_gyro).all(axis=2))
+    is_enough = (is_known.sum(axis=1) >= _MIN_STEPS) & (is_known @ durations_s >= _MIN_COVERED_S)
+    differences = np.where(is_enough, _spreads(by_gyro - rates, is_known), np.inf)
+    changes = _spreads(np.broadcast_to(rates, by_gyro.shape), is_known)
     best = int(np.argmin(differences))
-    least, change = differences[best], changes[best]
+    least, change = float(differences[best]), float(changes[best])
     if not 0 < best < 2 * count or change < _MIN_CHANGE_RAD_S or least > _RATE_NOISE_RAD_S + _ERROR_SHARE * change:
         return None
     others: Bool = np.abs(shifts - shifts[best]) > _LOBE_S
-    if (np.array(differences)[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
+    if (differences[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
         return None
     shift_s = float(shifts[best]) + _beyond(differences[best - 1 : best + 2])
     return shift_s if _shows_gravity(steps, readings, round(shift_s * 1e9)) else None
 
 
-def _shows_gravity(steps: Sequence[VisualStep], readings: Readings, shift_ns: int) -> bool:
+def _shows_gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int) -> bool:
     """Whether specific forces at a shift are the cameras' accelerations and gravity."""
     first_R_end, gravity, accelerations = np.eye(3), [], []
     middles_ns = np.array([(each.begin_ns + each.end_ns) // 2 for each in steps])
-    forces = readings(middles_ns[:-1] + shift_ns, middles_ns[1:] + shift_ns)[:, 3:]
+    forces = readings.between(middles_ns[:-1] + shift_ns, middles_ns[1:] + shift_ns)[:, 3:]
     for one, other, force in zip(steps[:-1], steps[1:], forces, strict=True):
         first_R_end = first_R_end @ one.begin_T_end[:3, :3]
         before, after = (each.begin_T_end[:3, 3] / ((each.end_ns - each.begin_ns) * 1e-9) for each in (one, other))
@@ -101,10 +98,18 @@ def _shows_gravity(steps: Sequence[VisualStep], readings: Readings, shift_ns: in
 
 def _spread(vectors: Float) -> float:
     """Return the RMS of vectors (N, 3) about their mean."""
-    return float(np.sqrt(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return float(_spreads(vectors[None], np.ones((1, len(vectors)), dtype=bool))[0])
 
 
-def _beyond(differences: Sequence[float]) -> float:
+def _spreads(vectors: Float, is_known: Bool) -> Float:
+    """Return for each set (S,) of vectors (S, N, 3) the RMS of those that are known (S, N) about their mean."""
+    count = np.maximum(is_known.sum(axis=1), 1)
+    means = np.where(is_known[..., None], vectors, 0.0).sum(axis=1) / count[:, None]
+    squares = ((vectors - means[:, None]) ** 2).sum(axis=2)
+    return np.asarray(np.sqrt(np.where(is_known, squares, 0.0).sum(axis=1) / count))
+
+
+def _beyond(differences: Float) -> float:
     """Return how far from the middle one of three shifts the minimum of the parabola through the squares is."""
     before, at, after = np.square(differences)
     curvature = before - 2.0 * at + after

@@ -103,23 +103,10 @@ class ImuBuffer:
         interval = self.interval(int(stamps[0]), int(stamps[-1])) if len(stamps) > 1 else None
         return None if interval is None else (interval, int(stamps[0]))
 
-    def mean_readings(self, begins_ns: Int, ends_ns: Int) -> Float:
-        """Return mean angular rates and specific forces (N, 6) in intervals (N,), NaN in those that are not covered."""
-        stamps = self._stamps[self._first : self._end]
-        if len(stamps) < 2:
-            return np.full((len(begins_ns), 6), np.nan)
-        values, steps_ns = self._values[self._first : self._end], np.diff(stamps)
-        sums = np.vstack([np.zeros(6), np.cumsum(0.5 * (values[1:] + values[:-1]) * steps_ns[:, None], axis=0)])
-        gaps = np.concatenate([[0], np.cumsum(steps_ns > self._max_gap_ns)])  # until each sample
-        at = [np.clip(np.searchsorted(stamps, ns, "right") - 1, 0, len(stamps) - 2) for ns in (begins_ns, ends_ns)]
-        totals = []
-        for k, ns in zip(at, (begins_ns, ends_ns), strict=True):
-            after = (ns - stamps[k])[:, None]
-            slope = (values[k + 1] - values[k]) / steps_ns[k][:, None]
-            totals.append(sums[k] + after * (values[k] + 0.5 * after * slope))
-        is_covered = (begins_ns >= stamps[0]) & (ends_ns <= stamps[-1]) & (gaps[at[0]] == gaps[at[1] + 1])
-        means = (totals[1] - totals[0]) / (ends_ns - begins_ns)[:, None]
-        return np.where(is_covered[:, None], means, np.nan)
+    def means(self, offset_ns: int = 0) -> MeanReadings:
+        """Return the means of the samples that are kept now, by stamps from which an offset is subtracted."""
+        kept = slice(self._first, self._end)
+        return MeanReadings(self._stamps[kept] - offset_ns, self._values[kept].copy(), self._max_gap_ns)
 
     def since(self, stamp_ns: int) -> tuple[Int, Float]:
         """Return the IMU at an instant, interpolated, and its samples after it.
@@ -157,6 +144,42 @@ class ImuBuffer:
         self._stamps, self._values = np.empty(room, dtype=np.int64), np.empty((room, 6))
         self._stamps[: len(stamps)], self._values[: len(stamps)] = stamps, values
         self._first, self._end = 0, len(stamps)
+
+
+class MeanReadings:
+    """Mean readings of an IMU in intervals, from integrals over all of its samples.
+
+    Args:
+        stamps_ns: (N,) increasing stamps of the samples.
+        values: (N, 6) angular velocities and specific forces.
+        max_gap_ns: Longer intervals between samples are gaps.
+    """
+
+    def __init__(self, stamps_ns: Int, values: Float, max_gap_ns: int) -> None:
+        self._stamps, self._values = stamps_ns, values
+        self._steps_ns = np.diff(stamps_ns)
+        means = 0.5 * (values[1:] + values[:-1])
+        self._sums = np.vstack([np.zeros(6), np.cumsum(means * self._steps_ns[:, None], axis=0)])  # until each sample
+        self._gaps = np.concatenate([[0], np.cumsum(self._steps_ns > max_gap_ns)])
+
+    def between(self, begins_ns: Int, ends_ns: Int) -> Float:
+        """Return the means (K, 6) between stamps (K,) and (K,), NaN where an interval is not covered."""
+        if len(self._stamps) < 2:
+            return np.full((len(begins_ns), 6), np.nan)
+        first, last = self._step_at(begins_ns), self._step_at(ends_ns)
+        is_covered = (begins_ns >= self._stamps[0]) & (ends_ns <= self._stamps[-1])
+        is_covered &= self._gaps[first] == self._gaps[last + 1]
+        total = self._integral(last, ends_ns) - self._integral(first, begins_ns)
+        return np.where(is_covered[:, None], total / (ends_ns - begins_ns)[:, None], np.nan)
+
+    def _step_at(self, stamps_ns: Int) -> Int:
+        return np.clip(np.searchsorted(self._stamps, stamps_ns, "right") - 1, 0, len(self._stamps) - 2)
+
+    def _integral(self, k: Int, stamps_ns: Int) -> Float:
+        """Return the integrals until stamps that lie in steps ``k``, between whose ends the readings are linear."""
+        after_ns = (stamps_ns - self._stamps[k])[:, None]
+        slopes = (self._values[k + 1] - self._values[k]) / self._steps_ns[k][:, None]
+        return np.asarray(self._sums[k] + after_ns * (self._values[k] + 0.5 * after_ns * slopes))
 
 
 class _StuckAxes:

@@ -156,7 +156,8 @@ def _print_summary(summary: Summary, folder: Path, rig: Rig) -> None:
     doubtful = sum(summary.events.get(kind, 0) for kind in _DOUBTFUL)
     if doubtful > _MAX_DOUBTFUL_SHARE * summary.framesets:
         warn(
-            f"vision failed, was weak, or contradicted the IMU {doubtful} times in {summary.framesets} framesets: see "
+            f"vision failed, was weak, or contradicted the IMU in {min(doubtful, summary.framesets)} of "
+            f"{summary.framesets} framesets: see "
             f"{folder / 'events.jsonl'}; check the calibration (graphvio rig), the IMU's units and axes, and compare "
             "with --no-imu"
         )

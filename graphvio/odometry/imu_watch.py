@@ -128,7 +128,7 @@ class ImuWatch:
         """Use the IMU again if it moves as the cameras do, now or at another time."""
         self._next_ns = stamp_ns + _CHECK_NS
         steps = [step for step in self._steps if step.begin_ns >= self._since_ns]
-        shift_s = matching_shift(steps, self._synchroniser.mean_readings, _MAX_SHIFT_S)
+        shift_s = matching_shift(steps, self._synchroniser.mean_readings(), _MAX_SHIFT_S)
         if shift_s is None or shift_s > self._max_late_s:
             return False
         self.is_left_out = False

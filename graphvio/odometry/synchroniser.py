@@ -9,7 +9,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.inertial import ImuBuffer
+from graphvio.backend.inertial import ImuBuffer, MeanReadings
 from graphvio.config import Config
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
@@ -168,9 +168,9 @@ class Synchroniser:
                 return self.imu_correction.applied_to(interval), (at_ns - found[1]) * 1e-9
         return None
 
-    def mean_readings(self, begins_ns: Int, ends_ns: Int) -> Float:
-        """Return mean readings (N, 6), not corrected, between framesets' stamps (N,), NaN where they are missing."""
-        return self._imu.mean_readings(begins_ns + self._offset_ns, ends_ns + self._offset_ns)
+    def mean_readings(self) -> MeanReadings:
+        """Return the means of the samples that are kept, not corrected, by the framesets' clock."""
+        return self._imu.means(self._offset_ns)
 
     def shift_clock(self, seconds: float) -> None:
         """Take the stamps of samples that come from now on to be late by so many seconds more; older ones are dropped.

@@ -171,6 +171,17 @@ def _half() -> Change:
     return _of_framesets(lambda frameset: frameset if rng.random() < 0.5 else None)
 
 
+def _by_another_clock(late_s: float) -> Callable[[], Change]:
+    late_ns = round(late_s * 1e9)
+    return lambda: _of_samples(lambda s: replace(s, stamp_ns=s.stamp_ns + late_ns))
+
+
+def _turned() -> Change:
+    """About body's z by 90 degrees."""
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return _of_samples(lambda s: ImuSample(s.stamp_ns, turn @ s.angular_velocity, turn @ s.linear_acceleration))
+
+
 def _jumped(jump_s: float) -> Callable[[], Change]:
     jump_ns = round(jump_s * 1e9)
     return lambda: lambda measurement: [replace(measurement, stamp_ns=measurement.stamp_ns + jump_ns)]
@@ -189,6 +200,7 @@ _COASTED = f"{_COASTED_ON}; {_GOES_ON}"
 _LOST = "coasts, then reports that it is lost and gives no pose; a new epoch when images are back"
 _VISION_GOES_ON = "vision goes on without the IMU"
 _LEFT_OUT = "the axis that sticks is reported; vision goes on without the IMU"
+_CLOCK = "the IMU is left out after half a second, and its clock corrected"
 _NEW_EPOCH = "a new epoch at the last pose"
 
 CASES = (
@@ -210,6 +222,10 @@ CASES = (
     Case("one sample of the IMU repeated, 2 s", _LEFT_OUT, _repeated, end_s=_after(2.0)),
     Case("gyro cut off at 0.15 rad/s, 3 s", "vision is refused for a second at most, then used", _cut_off,
          end_s=_after(3.0)),
+    Case("IMU 100 ms late by its stamps, throughout", _CLOCK, _by_another_clock(0.1), begin_s=-math.inf),
+    Case("IMU's clock jumps by -0.1 s", _CLOCK, _by_another_clock(-0.1)),
+    Case("IMU's axes turned by 90 degrees, throughout", "the IMU is left out after half a second", _turned,
+         begin_s=-math.inf),
     Case("axis 2 stuck while all pairs are black, 0.5 s", "coasts with growing uncertainty; " + _GOES_ON,
          _stuck_and_black, end_s=_after(0.5)),
     Case("all twice and with backward stamps, throughout", "both are left out: the same poses", _muddled,
