@@ -328,6 +328,27 @@ FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, int], int, int]] = {
     "IMU CR": (csv_edit("imu0", lambda rows: None, "\r"), {}, 10, ALL_SAMPLES),
     "IMU without header": (csv_edit("imu0", drop(slice(0, 1))), {}, 10, ALL_SAMPLES),
     "IMU header in words": (csv_edit("imu0", replace(0, "timestamp,wx,wy,wz,ax,ay,az")), {}, 10, ALL_SAMPLES),
+    "IMU semicolons": (
+        csv_edit("imu0", lambda rows: rows.__setitem__(slice(None), [r.replace(",", ";") for r in rows])),
+        {},
+        10,
+        ALL_SAMPLES,
+    ),
+    "IMU semicolons and decimal commas, without header": (
+        csv_edit(
+            "imu0",
+            lambda rows: rows.__setitem__(slice(None), [r.replace(",", ";").replace(".", ",") for r in rows[1:]]),
+        ),
+        {},
+        10,
+        ALL_SAMPLES,
+    ),
+    "frame semicolons": (
+        both(CAMERAS, lambda rows: rows.__setitem__(slice(None), [r.replace(",", ";") for r in rows])),
+        {},
+        10,
+        ALL_SAMPLES,
+    ),
     "IMU blank lines": (csv_edit("imu0", put(9, "", "# a remark", "  ")), {}, 10, ALL_SAMPLES),
     "IMU extra column": (
         csv_edit("imu0", replace(9, imu_row(IMU_T0 + 8 * IMU_PERIOD_NS) + ",25.0")),

@@ -103,16 +103,21 @@ def open_recording(
     """Open a recording as the options of a command ask for it, see `graphvio.cli.options`."""
     from graphvio.rig_files import load_rig
     from graphvio.sources import open_source
+    from graphvio.sources.faults import unlogged
 
     check_scene(source)
     tolerance_ms = settings.timing.simultaneous_ms
     loaded = None if rig is None else load_rig(rig)
     mapped = parsed_topics(topics)
-    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
-    chosen = chosen_rig(opened.rig, pairs, cameras, no_pairs, no_imu)
-    if chosen is opened.rig:
-        return opened
-    return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
+
+    def opened(rig: Rig | None) -> Source:
+        return open_source(source, rig, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
+
+    if not (pairs or cameras or no_pairs or no_imu):
+        return opened(loaded)
+    with unlogged():  # the faults are those of the cameras that are chosen
+        whole = opened(loaded).rig
+    return opened(chosen_rig(whole, pairs, cameras, no_pairs, no_imu))
 
 
 def check_scene(source: Path) -> None:

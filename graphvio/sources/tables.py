@@ -219,10 +219,17 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         line = line.strip()
         if not line or line.startswith("#"):
             continue
-        cells = [cell.strip() for cell in (line.split(",") if "," in line else line.split())]
+        cells = _cells(line)
         if not (is_first and not any(_is_number(cell) for cell in cells)):
             yield number, cells
         is_first = False
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells of a row that commas, spaces or semicolons separate; with semicolons, commas are decimal."""
+    if ";" in line:
+        return [cell.strip().replace(",", ".") for cell in line.split(";")]
+    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def read_lines(path: Path) -> list[str]:
