@@ -41,6 +41,10 @@ def with_late_clock(rig: Rig, seconds: float) -> Rig:
     return rig
 
 
+def _relative(seconds: float) -> str:
+    return f"{1e3 * abs(seconds):.0f} ms {'later' if seconds > 0.0 else 'earlier'}"
+
+
 def _bears_out(report: PairReport) -> bool:
     """Whether most of what a pair sees moves as the motion says."""
     return report.inliers >= max(_MIN_INLIERS, 0.5 * report.points)
@@ -80,7 +84,7 @@ class ImuWatch:
         found, shift_s = [], self._synchroniser.clock_shift_s
         if shift_s:
             found.append(
-                f"IMU: its stamps are {1e3 * shift_s:.0f} ms late by the rig's time offset; corrected for this run"
+                f"IMU: its stamps are {_relative(shift_s)} than by the rig's time offset; corrected for this run"
             )
         if self.is_left_out:
             found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
@@ -136,12 +140,8 @@ class ImuWatch:
             self._report(stamp_ns, EventKind.IMU_USED_AGAIN, "it moves as the cameras do")
             return True
         self._synchroniser.shift_clock(shift_s)
-        late = f"{1e3 * abs(shift_s):.0f} ms {'later' if shift_s > 0.0 else 'earlier'}"
-        self._report(
-            stamp_ns,
-            EventKind.IMU_CLOCK_OFF,
-            f"it moves as the cameras do by stamps that are {late}; corrected for this run",
-        )
+        detail = f"it moves as the cameras do by stamps that are {_relative(shift_s)}; corrected for this run"
+        self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, detail)
         return True
 
     def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:

@@ -154,12 +154,7 @@ class Odometry:
             if self.rig.imu is not None and self.rig.imu.has_matrices:
                 measurement = calibrated_sample(measurement, self.rig.imu)
             for sample in self._synchroniser.add_sample(measurement):
-                if self._imu.is_left_out:
-                    continue
-                self._calibration.add_sample(sample)
-                corrected = self._synchroniser.corrected(sample)
-                self._estimator.add_sample(*corrected)
-                self._propagate(*corrected)
+                self._add_sample(sample)
         else:
             self._synchroniser.add_frameset(measurement)
         return self.process_due()
@@ -440,9 +435,15 @@ class Odometry:
             *samples,
         )
 
-    def _propagate(self, stamp_ns: int, sample: Float) -> None:
-        """Carry the prediction on by an IMU sample (6,)."""
-        if self._propagator.add(stamp_ns, sample) and self._on_prediction is not None:
+    def _add_sample(self, sample: ImuSample) -> None:
+        """Hand on a sample, and the prediction at it to those who asked for it; by vision where the IMU is left out."""
+        stamp_ns, values = self._synchroniser.corrected(sample)
+        is_next = self._imu.is_left_out
+        if not is_next:
+            self._calibration.add_sample(sample)
+            self._estimator.add_sample(stamp_ns, values)
+            is_next = self._propagator.add(stamp_ns, values)
+        if is_next and self._on_prediction is not None:
             prediction = self._propagator.predict(stamp_ns)
             if prediction is not None:
                 self._on_prediction(prediction)

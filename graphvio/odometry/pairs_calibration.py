@@ -93,7 +93,7 @@ class PairsCalibration:
 
     def restart_imu(self) -> None:
         """Leave the window that has samples of before."""
-        self._calibration.start_window()
+        self._calibration.restart_imu()
 
     def with_allowance(self, visual: VisualResult) -> VisualResult:
         """Return motions with what errors of the calibration make them contradict the IMU by."""

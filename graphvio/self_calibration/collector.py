@@ -79,6 +79,9 @@ class WindowCollector:
     def restart(self) -> None:
         """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
         self.keyframes, self._last = [], None
+
+    def forget_samples(self) -> None:
+        """Forget the IMU samples until now."""
         self._samples.clear()
 
     def samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:

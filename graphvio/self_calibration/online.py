@@ -171,6 +171,11 @@ class SelfCalibration:
         self._collector.restart()
         self._adjusted_at = 0
 
+    def restart_imu(self) -> None:
+        """Leave the window that is not full, and the IMU samples until now: those that come are of another clock."""
+        self.start_window()
+        self._collector.forget_samples()
+
     def update(self) -> bool:
         """Take the result that comes into force after this frameset, if there is one.
 
