@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float
-from graphvio.backend.imu_match import VisualStep, matching_shift
+from graphvio.backend.imu_match import VisualStep, match_imu
 from graphvio.backend.inertial import ImuBuffer, MeanReadings
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
@@ -16,6 +16,7 @@ from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 RATE_HZ, FRAMES_HZ = 200, 20
 MAX_SHIFT_S = 0.5
 FIRST_NS = 10_000_000_000
+BIAS = np.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.08])
 
 
 def angles(t: float) -> Float:
@@ -47,7 +48,6 @@ def readings(
     until_s: float = 6.0,
 ) -> MeanReadings:
     buffer, h = ImuBuffer(50.0), 1e-4
-    bias = np.array([0.02, -0.01, 0.03, 0.1, -0.05, 0.08])
     for k in range(-RATE_HZ, round(until_s * RATE_HZ)):
         t = k / RATE_HZ
         world_R_body = so3_exp(angles(t))
@@ -55,16 +55,19 @@ def readings(
         rate = np.array([turned[2, 1], turned[0, 2], turned[1, 0]])
         acceleration = (position(t + h) - 2.0 * position(t) + position(t - h)) / h**2
         force = world_R_body.T @ (acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
-        values = change(np.concatenate([rate, force])) + bias
+        values = change(np.concatenate([rate, force])) + BIAS
         assert not buffer.add(ImuSample(FIRST_NS + round((t + late_s) * 1e9), values[:3], values[3:]))
     return buffer.means()
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.002, -0.0137, 0.1, -0.45])
-def test_matching_shift_is_that_of_the_clock(late_s: float) -> None:
-    found = matching_shift(steps(3.5, noise=1e-4), readings(late_s), MAX_SHIFT_S)
+def test_match_imu_is_that_of_the_clock(late_s: float) -> None:
+    found = match_imu(steps(3.5, noise=1e-4), readings(late_s), MAX_SHIFT_S)
     assert found is not None
-    assert found == pytest.approx(late_s, abs=0.001)
+    assert found.shift_s == pytest.approx(late_s, abs=0.001)
+    np.testing.assert_allclose(found.gyro_bias, BIAS[:3], atol=0.005)  # the shift is on a grid of 5 ms there
+    down = pose(3.5)[:3, :3].T @ np.array([0.0, 0.0, -GRAVITY_M_S2])
+    np.testing.assert_allclose(found.gravity_body, down, atol=0.2)
 
 
 def scaled(gyro: float = 1.0, force: float = 1.0) -> Callable[[Float], Float]:
@@ -82,22 +85,22 @@ def scaled(gyro: float = 1.0, force: float = 1.0) -> Callable[[Float], Float]:
         pytest.param(lambda values: values[[1, 0, 2, 4, 3, 5]], id="axes swapped"),
     ],
 )
-def test_matching_shift_of_an_imu_that_is_not_the_rigs_is_none(change: Callable[[Float], Float]) -> None:
-    assert matching_shift(steps(3.5), readings(0.0, change), MAX_SHIFT_S) is None
+def test_match_imu_of_an_imu_that_is_not_the_rigs_is_none(change: Callable[[Float], Float]) -> None:
+    assert match_imu(steps(3.5), readings(0.0, change), MAX_SHIFT_S) is None
 
 
-def test_matching_shift_without_turns_or_time_is_none() -> None:
-    assert matching_shift(steps(3.5, still=True), readings(0.0), MAX_SHIFT_S) is None
-    assert matching_shift(steps(1.5), readings(0.0), MAX_SHIFT_S) is None
-    assert matching_shift(steps(3.5), readings(0.0, until_s=1.5), MAX_SHIFT_S) is None
-    assert matching_shift([], readings(0.0), MAX_SHIFT_S) is None
+def test_match_imu_without_turns_or_time_is_none() -> None:
+    assert match_imu(steps(3.5, still=True), readings(0.0), MAX_SHIFT_S) is None
+    assert match_imu(steps(1.5), readings(0.0), MAX_SHIFT_S) is None
+    assert match_imu(steps(3.5), readings(0.0, until_s=1.5), MAX_SHIFT_S) is None
+    assert match_imu([], readings(0.0), MAX_SHIFT_S) is None
 
 
-def test_matching_shift_beyond_the_largest_one_is_none() -> None:
-    assert matching_shift(steps(3.5), readings(0.8), MAX_SHIFT_S) is None
+def test_match_imu_beyond_the_largest_one_is_none() -> None:
+    assert match_imu(steps(3.5), readings(0.8), MAX_SHIFT_S) is None
 
 
-def test_matching_shift_of_a_turn_that_repeats_is_none() -> None:
+def test_match_imu_of_a_turn_that_repeats_is_none() -> None:
     """Several shifts fit as well as each other."""
     times = np.arange(0, 4, 1 / FRAMES_HZ)
 
@@ -122,7 +125,7 @@ def test_matching_shift_of_a_turn_that_repeats_is_none() -> None:
                 np.array([1e-3 * t, 2e-3 * t, GRAVITY_M_S2]),
             )
         )
-    assert matching_shift(made, buffer.means(), MAX_SHIFT_S) is None
+    assert match_imu(made, buffer.means(), MAX_SHIFT_S) is None
 
 
 def test_mean_readings_are_those_of_the_intervals_and_nan_in_gaps() -> None:

@@ -36,7 +36,21 @@ class VisualStep(NamedTuple):
     begin_T_end: Float  # (4, 4) of body
 
 
-def matching_shift(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> float | None:
+class ImuMatch(NamedTuple):
+    """An IMU that moves as the cameras do.
+
+    Attributes:
+        shift_s: By how many seconds its stamps are late.
+        gyro_bias: (3,) rad/s.
+        gravity_body: (3,) m/s^2 in body at the end of the last step.
+    """
+
+    shift_s: float
+    gyro_bias: Float
+    gravity_body: Float
+
+
+def match_imu(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> ImuMatch | None:
     """Find the only shift of its stamps at which the IMU moves as the cameras do.
 
     Args:
@@ -45,8 +59,8 @@ def matching_shift(steps: Sequence[VisualStep], readings: MeanReadings, max_shif
         max_shift_s: Largest shift that is tried, either way.
 
     Returns:
-        By how many seconds the IMU's stamps are late; None where there is no such shift, where less than 2 s of vision
-        and IMU are known there, or the rig does not turn.
+        None where there is no such shift, where less than 2 s of vision and IMU are known there, or the rig does not
+        turn.
     """
     if not steps:
         return None
@@ -71,12 +85,16 @@ def matching_shift(steps: Sequence[VisualStep], readings: MeanReadings, max_shif
     if (differences[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
         return None
     shift_s = float(shifts[best]) + _beyond(differences[best - 1 : best + 2])
-    return shift_s if _shows_gravity(steps, readings, round(shift_s * 1e9)) else None
+    gravity_body = _gravity(steps, readings, round(shift_s * 1e9))
+    if gravity_body is None:
+        return None
+    gyro_bias = (by_gyro[best] - rates)[is_known[best]].mean(axis=0)
+    return ImuMatch(shift_s, gyro_bias, gravity_body)
 
 
-def _shows_gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int) -> bool:
-    """Whether specific forces at a shift are the cameras' accelerations and gravity."""
-    first_R_end, gravity, accelerations = np.eye(3), [], []
+def _gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int) -> Float | None:
+    """Return gravity (3,) in body at the end, by specific forces at a shift, or None if they show something else."""
+    first_R_end, against_gravity, accelerations = np.eye(3), [], []
     middles_ns = np.array([(each.begin_ns + each.end_ns) // 2 for each in steps])
     forces = readings.between(middles_ns[:-1] + shift_ns, middles_ns[1:] + shift_ns)[:, 3:]
     for one, other, force in zip(steps[:-1], steps[1:], forces, strict=True):
@@ -85,15 +103,17 @@ def _shows_gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns
         between_s = 0.5e-9 * (other.end_ns - one.begin_ns)
         acceleration = (after - one.begin_T_end[:3, :3].T @ before) / between_s  # in body between the two steps
         if not np.isnan(force).any():
-            gravity.append(first_R_end @ (force - acceleration))
+            against_gravity.append(first_R_end @ (force - acceleration))
             accelerations.append(acceleration)
-    if len(gravity) < _MIN_STEPS:
-        return False
-    norm, change = float(np.linalg.norm(np.mean(gravity, axis=0))), _spread(np.array(accelerations))
-    return (
-        abs(norm - GRAVITY_M_S2) < _MAX_GRAVITY_ERROR_M_S2
-        and _spread(np.array(gravity)) < _FORCE_NOISE_M_S2 + _ERROR_SHARE * change
-    )
+    if len(against_gravity) < _MIN_STEPS:
+        return None
+    mean, change = np.mean(against_gravity, axis=0), _spread(np.array(accelerations))
+    if abs(np.linalg.norm(mean) - GRAVITY_M_S2) > _MAX_GRAVITY_ERROR_M_S2:
+        return None
+    if _spread(np.array(against_gravity)) > _FORCE_NOISE_M_S2 + _ERROR_SHARE * change:
+        return None
+    first_R_end = first_R_end @ steps[-1].begin_T_end[:3, :3]
+    return np.asarray(-GRAVITY_M_S2 * (first_R_end.T @ mean) / np.linalg.norm(mean))
 
 
 def _spread(vectors: Float) -> float:

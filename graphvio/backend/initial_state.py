@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.imu_match import ImuMatch
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
 from graphvio.backend.states import (
     InitialUncertainty,
@@ -143,15 +144,21 @@ def from_vision(
     return _reinitialised(motion.stamp_ns, state, covariance, gravity_covariance, gyro_bias_sigma)
 
 
-def with_unknown_imu(motion: RelativeMotion, state: RigState, covariance: StateCovariance) -> InitialState:
-    """Reinitialise at the present pose for an IMU whose errors are not known, nor by it where gravity points.
+def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covariance: StateCovariance) -> InitialState:
+    """Reinitialise at the present pose for an IMU that was not used until now.
 
     Args:
         motion: By vision, that ends in the state.
+        match: How the IMU moves beside vision.
         state: The newest one.
         covariance: Of that.
     """
-    state = replace(_with_velocity(state, motion), gyro_bias=np.zeros(3), accel_bias=np.zeros(3))
+    state = replace(
+        _with_velocity(state, motion),
+        gyro_bias=match.gyro_bias,
+        accel_bias=np.zeros(3),
+        gravity_nav=state.nav_T_body[:3, :3] @ match.gravity_body,
+    )
     initial = with_wide_attitude(_reinitialised(motion.stamp_ns, state, covariance.pose, covariance.gravity))
     return replace(initial, is_known=True)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
+from graphvio.backend.imu_match import ImuMatch
 from graphvio.backend.initial_state import (
     MAX_UNBRIDGED_S,
     InitialState,
@@ -17,7 +18,7 @@ from graphvio.backend.initial_state import (
     first_state_at,
     from_vision,
     with_free_gravity,
-    with_unknown_imu,
+    with_new_imu,
     with_wide_attitude,
 )
 from graphvio.backend.smoother import Smoother
@@ -199,18 +200,19 @@ class SmootherEstimator:
         return StateUpdate(status, needs_keyframe=is_rebuilt)
 
     def leave_imu_out(self) -> None:
-        """Take note that the IMU is left out, until `forget_imu`: nothing more of it will complete the state."""
+        """Take note that the IMU is left out, until `use_imu_again`: nothing more of it will complete the state."""
         self._is_imu_left_out = True
 
-    def forget_imu(self, motion: RelativeMotion) -> None:
-        """Take IMU errors and gravity to be unknown from now on, since the IMU so far has not been right.
+    def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
+        """Reinitialise at the newest pose for an IMU that was left out, of which the state knows nothing that is right.
 
         Args:
             motion: By vision, that ends in the newest state.
+            match: How the IMU moves beside vision.
         """
         self._is_imu_left_out = False
         try:
-            initial = with_unknown_imu(motion, self.state(), self.covariance)
+            initial = with_new_imu(motion, match, self.state(), self.covariance)
             self._reinitialise(initial, self.latest_ns - 1)
         except SOLVER_ERRORS as error:
             self._rebuild(self.latest_ns, self.state(), error)

@@ -70,19 +70,19 @@ class ImuOfFramesets:
             visual: What vision measured there.
 
         Returns:
-            Whether it is left out from now on, used again, or by another clock.
+            Whether it is left out from now on, or used again.
         """
         if self._watch is None:
             return False
         assert isinstance(self._estimator, SmootherEstimator)
         was_left_out = self.is_left_out
         gate_result = None if interval is None else self._estimator.gate_results.get("vision")
-        is_new = self._watch.update(stamp_ns, visual, gate_result)
-        if is_new and visual.motion is not None:
-            self._estimator.forget_imu(visual.motion)
+        match = self._watch.update(stamp_ns, visual, gate_result)
+        if match is not None and visual.motion is not None:
+            self._estimator.use_imu_again(visual.motion, match)
         if self.is_left_out and not was_left_out:
             self._estimator.leave_imu_out()
-        return is_new or self.is_left_out != was_left_out
+        return self.is_left_out != was_left_out
 
     def is_awaited(self, stamp_ns: int) -> bool:
         """Whether the IMU's first sample is still awaited, without which there is nothing to initialise from."""

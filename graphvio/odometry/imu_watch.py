@@ -13,7 +13,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import replace
 
-from graphvio.backend.imu_match import VisualStep, matching_shift
+from graphvio.backend.imu_match import ImuMatch, VisualStep, match_imu
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.events import EventKind, Report
@@ -90,7 +90,7 @@ class ImuWatch:
             found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
         return found
 
-    def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> bool:
+    def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> ImuMatch | None:
         """Take a frameset.
 
         Args:
@@ -99,14 +99,14 @@ class ImuWatch:
             gate_result: Of the test against a prediction by the IMU; None where there was none.
 
         Returns:
-            Whether the IMU has changed: it is used again, or by another clock. What is known of its errors no longer
-            holds then.
+            How the IMU moves where it is used again, maybe by another clock: what the state has of its errors no longer
+            holds. Else None.
         """
         step_ns, self._before_ns = stamp_ns - self._before_ns, stamp_ns
         motion = visual.motion if visual.quality is Quality.GOOD else None
         self._add_step(step_ns, motion)
         if self.is_left_out:
-            return motion is not None and stamp_ns >= self._next_ns and self._compare(stamp_ns)
+            return None if motion is None or stamp_ns < self._next_ns else self._compare(stamp_ns)
         if motion is not None and gate_result is not None and step_ns < _MAX_STEP_NS:
             witnesses = min(sum(_bears_out(report) for report in visual.pairs.values()), _MAX_WITNESSES)
             self._refused.append((stamp_ns, 0 if gate_result.accepted else step_ns * max(witnesses, 1)))
@@ -114,7 +114,7 @@ class ImuWatch:
             self._refused.popleft()
         if sum(refused_ns for _, refused_ns in self._refused) >= self._max_refused_ns:
             self._leave_out(stamp_ns)
-        return False
+        return None
 
     def _leave_out(self, stamp_ns: int) -> None:
         """Leave the IMU out until the rotations since it was first refused can be compared."""
@@ -128,21 +128,21 @@ class ImuWatch:
             "it contradicts good images: is its clock right, and are its axes and units those of the rig?",
         )
 
-    def _compare(self, stamp_ns: int) -> bool:
+    def _compare(self, stamp_ns: int) -> ImuMatch | None:
         """Use the IMU again if it moves as the cameras do, now or at another time."""
         self._next_ns = stamp_ns + _CHECK_NS
         steps = [step for step in self._steps if step.begin_ns >= self._since_ns]
-        shift_s = matching_shift(steps, self._synchroniser.mean_readings(), _MAX_SHIFT_S)
-        if shift_s is None or shift_s > self._max_late_s:
-            return False
+        match = match_imu(steps, self._synchroniser.mean_readings(), _MAX_SHIFT_S)
+        if match is None or match.shift_s > self._max_late_s:
+            return None
         self.is_left_out = False
-        if abs(shift_s) < _MIN_SHIFT_S:
+        if abs(match.shift_s) < _MIN_SHIFT_S:
             self._report(stamp_ns, EventKind.IMU_USED_AGAIN, "it moves as the cameras do")
-            return True
-        self._synchroniser.shift_clock(shift_s)
-        detail = f"it moves as the cameras do by stamps that are {_relative(shift_s)}; corrected for this run"
-        self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, detail)
-        return True
+        else:
+            self._synchroniser.shift_clock(match.shift_s)
+            detail = f"it moves as the cameras do by stamps that are {_relative(match.shift_s)}; corrected for this run"
+            self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, detail)
+        return match
 
     def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:
         """Add the motion since the frameset before; where that is not known, what follows is not compared with it."""
