@@ -358,7 +358,8 @@ def test_an_unknown_time_offset_is_found(walk_folder: Path, measurements: list[M
         assert sigma_s < 1e-3
         assert abs(offset_s - 1e-3 * offset_ms) < 4.0 * sigma_s
     assert found.kinds.count("time_offset_off") == 1
-    assert found.error_m(6.0, 9.0) < 0.03 < ignored.error_m(6.0, 9.0)
+    assert found.error_m(6.0, 9.0) < 0.03
+    assert "imu_left_out" in ignored.kinds  # which is what an offset comes to that nobody estimates
     assert {e.status for e in found.between(6.0, 10.0)} == {Status.TRACKING}
 
 
