@@ -79,6 +79,19 @@ def test_clock_that_is_off_is_corrected(walk: Path, seconds: float) -> None:
     assert any(f"{1e3 * abs(seconds):.0f} ms" in warning for warning in walked.odometry.rig_warnings)
 
 
+def test_clock_that_is_too_late_is_reported(walk: Path) -> None:
+    """By that of the refined rig, a recording can be read in the order of instants."""
+    walked = Walked(walk, late(0.3))
+    assert (walked.events[LEFT_OUT], walked.events[USED_AGAIN], walked.events[CLOCK_OFF]) == (1, 0, 1)
+    assert walked.error_m < 0.03
+    refined = walked.odometry.refined_rig
+    assert refined is not None
+    assert refined.imu is not None
+    assert refined.imu.time_offset_s == pytest.approx(0.3, abs=0.002)
+    (warning,) = walked.odometry.rig_warnings
+    assert "300 ms" in warning
+
+
 def test_clock_that_jumps_is_corrected(walk: Path) -> None:
     walked = Walked(walk, late(-0.06, FAULT_S))
     assert (walked.events[LEFT_OUT], walked.events[CLOCK_OFF]) == (1, 1)

@@ -21,7 +21,6 @@ from graphvio.cli.shared import (
 if TYPE_CHECKING:
     from graphvio.pipeline import Progress
     from graphvio.results import Summary
-    from graphvio.rig import Rig
 
 _DOUBTFUL = ("vision_failed", "vision_weak", "vision_gated")
 _MAX_DOUBTFUL_SHARE = 0.3  # of all framesets
@@ -95,7 +94,7 @@ def run(
             warn(f"interrupted; what was estimated until then is in {folder}")
             raise typer.Exit(EXIT_INTERRUPTED) from None
     publish(asdict(summary) | {"results": str(folder)})
-    _print_summary(summary, folder, opened.rig)
+    _print_summary(summary, folder)
     if summary.completion < MIN_COMPLETION:
         warn(
             f"only {100 * summary.completion:.0f} % of the framesets have a pose; "
@@ -133,9 +132,10 @@ class _ProgressLine(TerminalDisplay):
             self._print(text)
 
 
-def _print_summary(summary: Summary, folder: Path, rig: Rig) -> None:
+def _print_summary(summary: Summary, folder: Path) -> None:
     evaluation = summary.evaluation
-    remedy = "graphvio calibrate --what all finds by how much" if rig.pairs else f"{folder / 'rig-refined.yaml'} has it"
+    refined = folder / "rig-refined.yaml"
+    remedy = f"{refined} has it" if refined.exists() else "graphvio calibrate --what all finds by how much"
     typer.echo(
         f"{summary.estimated} of {summary.framesets} framesets estimated, {summary.path_length_m:.2f} m in "
         f"{summary.duration_s:.1f} s, {summary.realtime_factor:.2f} x real time"

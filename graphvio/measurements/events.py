@@ -38,7 +38,7 @@ class EventKind(StrEnum):
     IMU_USED_AGAIN = "imu_used_again"
     """An IMU that was left out moves as the cameras do; it is used again."""
     IMU_CLOCK_OFF = "imu_clock_off"
-    """The IMU moves as the cameras do, but earlier or later by its stamps; its clock is corrected for this run."""
+    """The IMU moves as the cameras do, but earlier or later by its stamps; its clock is corrected where that can be."""
     STARTED_WITHOUT_IMU = "started_without_imu"
     """No IMU samples came while the odometry waited for them; it is initialised without."""
     IMU_CAME = "imu_came"

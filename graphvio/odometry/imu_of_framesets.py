@@ -61,6 +61,11 @@ class ImuOfFramesets:
         """Where the IMU contradicts the rig, a sentence each."""
         return [] if self._watch is None else self._watch.warnings
 
+    @property
+    def clock_shift_s(self) -> float:
+        """See `ImuWatch`."""
+        return 0.0 if self._watch is None else self._watch.clock_shift_s
+
     def watch(self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult) -> bool:
         """Leave the IMU out while it contradicts vision.
 

@@ -41,10 +41,6 @@ def with_late_clock(rig: Rig, seconds: float) -> Rig:
     return rig
 
 
-def _relative(seconds: float) -> str:
-    return f"{1e3 * abs(seconds):.0f} ms {'later' if seconds > 0.0 else 'earlier'}"
-
-
 def _bears_out(report: PairReport) -> bool:
     """Whether most of what a pair sees moves as the motion says."""
     return report.inliers >= max(_MIN_INLIERS, 0.5 * report.points)
@@ -56,16 +52,20 @@ class ImuWatch:
     Args:
         max_refused_s: Vision of good quality that is refused for longer, within twice the time, is right. Where two
             pairs see the same motion, half of it is enough.
-        max_late_s: A clock that is later cannot be corrected: framesets do not wait for so long.
+        max_late_s: A clock that is later is reported, and not corrected: framesets do not wait for so long.
         synchroniser: Has the samples, and takes corrections of their clock.
         report: Receives events.
 
     Attributes:
         is_left_out: Whether the IMU is left out now.
+        clock_shift_s: By how much its stamps have been found to be later than by the rig's time offset.
     """
 
     def __init__(self, max_refused_s: float, max_late_s: float, synchroniser: Synchroniser, report: Report) -> None:
         self.is_left_out = False
+        self.clock_shift_s = 0.0
+        self._corrected_s = 0.0  # of it, for this run
+        self._is_too_late = False
         self._max_refused_ns = round(max_refused_s * 1e9)
         self._max_late_s = max_late_s
         self._synchroniser = synchroniser
@@ -81,14 +81,17 @@ class ImuWatch:
     @property
     def warnings(self) -> list[str]:
         """What contradicts the rig, a sentence each."""
-        found, shift_s = [], self._synchroniser.clock_shift_s
-        if shift_s:
-            found.append(
-                f"IMU: its stamps are {_relative(shift_s)} than by the rig's time offset; corrected for this run"
-            )
+        if self._is_too_late:
+            return [f"IMU: {self._relation}; it is left out, since framesets do not wait for so long"]
+        found = [f"IMU: {self._relation}; corrected for this run"] if self.clock_shift_s else []
         if self.is_left_out:
             found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
         return found
+
+    @property
+    def _relation(self) -> str:
+        later = "later" if self.clock_shift_s > 0.0 else "earlier"
+        return f"its stamps are {1e3 * abs(self.clock_shift_s):.0f} ms {later} than by the rig's time offset"
 
     def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> ImuMatch | None:
         """Take a frameset.
@@ -133,16 +136,28 @@ class ImuWatch:
         self._next_ns = stamp_ns + _CHECK_NS
         steps = [step for step in self._steps if step.begin_ns >= self._since_ns]
         match = match_imu(steps, self._synchroniser.mean_readings(), _MAX_SHIFT_S)
-        if match is None or match.shift_s > self._max_late_s:
+        if match is None:
             return None
-        self.is_left_out = False
+        if match.shift_s > self._max_late_s:
+            if not self._is_too_late:
+                self._is_too_late = True
+                self._report_clock(
+                    stamp_ns, match.shift_s, "it stays left out, since framesets do not wait for so long"
+                )
+            return None
         if abs(match.shift_s) < _MIN_SHIFT_S:
             self._report(stamp_ns, EventKind.IMU_USED_AGAIN, "it moves as the cameras do")
         else:
+            self._report_clock(stamp_ns, match.shift_s, "corrected for this run")
             self._synchroniser.shift_clock(match.shift_s)
-            detail = f"it moves as the cameras do by stamps that are {_relative(match.shift_s)}; corrected for this run"
-            self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, detail)
+            self._corrected_s = self.clock_shift_s
+        self.clock_shift_s = self._corrected_s
+        self.is_left_out = self._is_too_late = False
         return match
+
+    def _report_clock(self, stamp_ns: int, shift_s: float, what_is_done: str) -> None:
+        self.clock_shift_s = self._corrected_s + shift_s
+        self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, f"{self._relation}; {what_is_done}")
 
     def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:
         """Add the motion since the frameset before; where that is not known, what follows is not compared with it."""

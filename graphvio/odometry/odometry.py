@@ -242,8 +242,8 @@ class Odometry:
 
     @property
     def clock_shift_s(self) -> float:
-        """By how much the IMU's stamps have been found to be late beyond the rig's time offset, see `ImuWatch`."""
-        return self._synchroniser.clock_shift_s
+        """By how much the IMU's stamps have been found to be later than by the rig's time offset, see `ImuWatch`."""
+        return self._imu.clock_shift_s
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Register a function that gets the measurements of each full window of the self-calibration.

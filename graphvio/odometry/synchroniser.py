@@ -181,11 +181,6 @@ class Synchroniser:
         self._imu = ImuBuffer(self._timing.max_imu_gap_ms)
         self._sample_jumps = JumpGuard(EventKind.IMU_FUTURE_STAMP, self._report)
 
-    @property
-    def clock_shift_s(self) -> float:
-        """How late the IMU's clock has been found to be, which `time_offset_s` does not contain."""
-        return self._clock_ns * 1e-9
-
     def shift_imu(self, seconds: float) -> None:
         """Add a correction, seconds, to the offset of the IMU's stamps from the framesets'."""
         self._offset_ns += round(seconds * 1e9)
