@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.backend.inertial import MeanReadings
 from graphvio.geometry import so3_log
 from graphvio.measurements.sensors import GRAVITY_M_S2
@@ -34,6 +34,18 @@ class VisualStep(NamedTuple):
     begin_ns: int
     end_ns: int
     begin_T_end: Float  # (4, 4) of body
+
+
+class RateMatch(NamedTuple):
+    """A gyro that turns as the cameras do.
+
+    Attributes:
+        shift_s: By how many seconds its stamps are late.
+        gyro_bias: (3,) rad/s.
+    """
+
+    shift_s: float
+    gyro_bias: Float
 
 
 class ImuMatch(NamedTuple):
@@ -62,34 +74,83 @@ def match_imu(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: 
         None where there is no such shift, where less than 2 s of vision and IMU are known there, or the rig does not
         turn.
     """
+    found = match_rates(steps, readings, max_shift_s)
+    if found is None:
+        return None
+    gravity_body = _gravity(steps, readings, round(found.shift_s * 1e9))
+    return None if gravity_body is None else ImuMatch(*found, gravity_body)
+
+
+def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> RateMatch | None:
+    """Find the only shift of its stamps at which the gyro turns as the cameras do; see `match_imu`.
+
+    Translations are not used.
+    """
     if not steps:
         return None
-    begins_ns, ends_ns = (np.array([each[at] for each in steps], dtype=np.int64) for at in (0, 1))
-    durations_s = (ends_ns - begins_ns) * 1e-9
-    turns = np.array([so3_log(np.ascontiguousarray(each.begin_T_end[:3, :3])) for each in steps])
-    rates = turns / durations_s[:, None]
     count = round(max_shift_s / _SHIFT_STEP_S)
-    shifts = np.arange(-count, count + 1) * _SHIFT_STEP_S
-    shifts_ns = np.rint(shifts * 1e9).astype(np.int64)[:, None]
-    by_gyro = readings.between((begins_ns + shifts_ns).ravel(), (ends_ns + shifts_ns).ravel())[:, :3]
-    by_gyro = by_gyro.reshape(len(shifts), len(steps), 3)
-    is_known = np.asarray(np.isfinite(by_gyro).all(axis=2))
-    is_enough = (is_known.sum(axis=1) >= _MIN_STEPS) & (is_known @ durations_s >= _MIN_COVERED_S)
-    differences = np.where(is_enough, _spreads(by_gyro - rates, is_known), np.inf)
-    changes = _spreads(np.broadcast_to(rates, by_gyro.shape), is_known)
+    shifts = _SHIFT_STEP_S * np.arange(-count, count + 1, dtype=np.float64)
+    compared = _compared(steps, readings, shifts)
+    differences = compared.differences
     best = int(np.argmin(differences))
-    least, change = float(differences[best]), float(changes[best])
-    if not 0 < best < 2 * count or change < _MIN_CHANGE_RAD_S or least > _RATE_NOISE_RAD_S + _ERROR_SHARE * change:
+    least = float(differences[best])
+    if not 0 < best < 2 * count or not compared.is_alike(best):
         return None
     others: Bool = np.abs(shifts - shifts[best]) > _LOBE_S
     if (differences[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
         return None
     shift_s = float(shifts[best]) + _beyond(differences[best - 1 : best + 2])
-    gravity_body = _gravity(steps, readings, round(shift_s * 1e9))
-    if gravity_body is None:
+    return RateMatch(shift_s, compared.errors[best][compared.is_known[best]].mean(axis=0))
+
+
+def turn_disagreement(steps: Sequence[VisualStep], readings: MeanReadings) -> float | None:
+    """Return how far apart gyro and cameras turn by the gyro's stamps, as a multiple of what errors of both explain.
+
+    It is the median of the steps, so that a few that vision got wrong do not count. None where the IMU does not cover
+    them, or the rig hardly turns.
+    """
+    begins_ns, ends_ns, rates = _rates(steps)
+    errors = readings.between(begins_ns, ends_ns)[:, :3] - rates
+    change = _spread(rates)
+    if not len(steps) or np.isnan(errors).any() or change < _MIN_CHANGE_RAD_S:
         return None
-    gyro_bias = (by_gyro[best] - rates)[is_known[best]].mean(axis=0)
-    return ImuMatch(shift_s, gyro_bias, gravity_body)
+    apart = np.linalg.norm(errors - np.median(errors, axis=0), axis=1)
+    return float(np.median(apart)) / (_RATE_NOISE_RAD_S + _ERROR_SHARE * change)
+
+
+class _Compared(NamedTuple):
+    """Angular rates of N steps by vision and by the gyro, at S shifts of its stamps."""
+
+    errors: Float  # (S, N, 3) of the gyro, rad/s
+    is_known: Bool  # (S, N)
+    differences: Float  # (S,) RMS of the errors about their mean, rad/s; infinite where too few are known
+    changes: Float  # (S,) the same of vision's rates
+
+    def is_alike(self, at: int) -> bool:
+        """Whether the rates change, and do so together, at a shift."""
+        change = float(self.changes[at])
+        tolerance = _RATE_NOISE_RAD_S + _ERROR_SHARE * change
+        return change >= _MIN_CHANGE_RAD_S and float(self.differences[at]) <= tolerance
+
+
+def _compared(steps: Sequence[VisualStep], readings: MeanReadings, shifts: Float) -> _Compared:
+    """Compare the rates at some shifts (S,), seconds."""
+    begins_ns, ends_ns, rates = _rates(steps)
+    shifts_ns = np.rint(shifts * 1e9).astype(np.int64)[:, None]
+    by_gyro = readings.between((begins_ns + shifts_ns).ravel(), (ends_ns + shifts_ns).ravel())[:, :3]
+    errors = by_gyro.reshape(len(shifts), len(steps), 3) - rates
+    is_known = np.asarray(np.isfinite(errors).all(axis=2))
+    covered_s = is_known @ ((ends_ns - begins_ns) * 1e-9)
+    is_enough = (is_known.sum(axis=1) >= _MIN_STEPS) & (covered_s >= _MIN_COVERED_S)
+    differences = np.where(is_enough, _spreads(errors, is_known), np.inf)
+    return _Compared(errors, is_known, differences, _spreads(np.broadcast_to(rates, errors.shape), is_known))
+
+
+def _rates(steps: Sequence[VisualStep]) -> tuple[Int, Int, Float]:
+    """Return stamps (N,) at which steps begin and end, and their angular rates (N, 3), rad/s."""
+    begins_ns, ends_ns = (np.array([each[at] for each in steps], dtype=np.int64) for at in (0, 1))
+    turns = np.array([so3_log(np.ascontiguousarray(each.begin_T_end[:3, :3])) for each in steps]).reshape(-1, 3)
+    return begins_ns, ends_ns, turns / ((ends_ns - begins_ns) * 1e-9)[:, None]
 
 
 def _gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int) -> Float | None:

@@ -62,6 +62,7 @@ _MAX_CONTRADICTION_NS = 1_000_000_000
 _MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
 _REPORT_AFTER_NS = 5_000_000_000
+_TURNS_OTHERWISE = "the IMU turns otherwise than the cameras"
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
 _NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
 
@@ -84,15 +85,13 @@ class MonocularEstimator:
         self._config = config
         self._report = report
         self._cameras = Cameras.of(rig)
+        self._rig = rig
         self._calibration = WindowCalibration(rig, config.estimates_calibration)
-        self._samples = SampleBuffer(
-            rig.imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6)
-        )
+        self._samples = self._new_samples()
         self._shift_ns = 0  # of samples' stamps, for what the time offset was corrected by
-        self._has_imu = self._is_initialised = False
+        self._has_imu = self._is_initialised = self._is_imu_doubted = False
         self._sigma_px = _FIRST_SIGMA_PX
-        self._initialiser = self._new_initialiser()
-        self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
+        self._collect_keyframes()
         self._has_overlaps, self._are_trusted = False, True
         self._window: Window | None = None
         self._latest_ns = 0
@@ -286,7 +285,7 @@ class MonocularEstimator:
 
     def _initialising(self, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Collect keyframes, and begin the window once the scale is known."""
-        if self._has_imu and (is_keyframe or self._is_stationary):
+        if self._has_imu and not self._is_imu_doubted and (is_keyframe or self._is_stationary):
             window = self._initialiser.add(stamp_ns, self._sightings, self._is_stationary)
             instead = self._without_overlaps(stamp_ns, window)
             if instead is not None:
@@ -299,11 +298,13 @@ class MonocularEstimator:
 
     def _report_not_initialised(self, stamp_ns: int) -> None:
         self._is_reported = True
+        why = f"{self._initialiser.reason}; go on moving: speed up, brake and turn"
+        if self._is_imu_doubted:
+            why = f"{_TURNS_OTHERWISE}; are its clock and its axes those of the rig?"
         self._report(
             stamp_ns,
             EventKind.NOT_INITIALISED,
-            f"{(stamp_ns - self._since_ns) * 1e-9:.1f} s after the initialisation {self._initialiser.reason}; go "
-            "on moving: speed up, brake and turn",
+            f"{(stamp_ns - self._since_ns) * 1e-9:.1f} s after the initialisation {why}",
         )
 
     def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
@@ -477,10 +478,33 @@ class MonocularEstimator:
             self._report(stamp_ns, EventKind.LOST, why)
         self._window, self._before, self._contradicted_since_ns = None, None, None
         self._solved = None
-        self._initialiser = self._new_initialiser()
-        self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
+        self._collect_keyframes()
         self.covariance = _NO_COVARIANCE
         self._since_ns, self._is_reported = stamp_ns, False
+
+    def restart_imu(self, stamp_ns: int) -> None:
+        """End the epoch, and forget samples and calibration: they are by a clock that was wrong until a frameset."""
+        self._lose(stamp_ns, "the IMU's clock is corrected")
+        self._calibration = WindowCalibration(self._rig, self._config.estimates_calibration)
+        self._samples, self._shift_ns = self._new_samples(), 0
+        self._are_trusted = True
+        self._collect_keyframes()
+
+    def doubt_imu(self, stamp_ns: int, is_doubted: bool) -> None:
+        """Take note of whether the IMU turns as the cameras do; where it does not, there is no pose."""
+        self._is_imu_doubted = is_doubted
+        if is_doubted and self._window is not None:
+            self._lose(stamp_ns, _TURNS_OTHERWISE)
+
+    def _collect_keyframes(self) -> None:
+        """Begin to look for the scale."""
+        self._initialiser = self._new_initialiser()
+        self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
+
+    def _new_samples(self) -> SampleBuffer:
+        imu, config = self._rig.imu, self._config
+        assert imu is not None
+        return SampleBuffer(imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6))
 
     def _new_initialiser(self, doubts_file: bool = True) -> Initialiser:
         return Initialiser(self._cameras, self._calibration, self._samples.between, _FIRST_SIGMA_PX, doubts_file)

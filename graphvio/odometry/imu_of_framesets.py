@@ -14,6 +14,9 @@ from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import VisualResult
+from graphvio.monocular.estimator import MonocularEstimator
+from graphvio.odometry.clock_watch import ClockWatch
+from graphvio.odometry.imu_clock import ImuClock
 from graphvio.odometry.imu_watch import ImuWatch
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
@@ -43,11 +46,13 @@ class ImuOfFramesets:
         self._synchroniser = synchroniser
         self._estimator = estimator
         self._report = report
+        self._clock = ImuClock(config.timing.max_imu_wait_ms * 1e-3, synchroniser, report)
         self._watch: ImuWatch | None = None
+        self._clock_watch: ClockWatch | None = None
         if rig.imu is not None and isinstance(estimator, SmootherEstimator):
-            self._watch = ImuWatch(
-                config.smoother.max_gated_s, config.timing.max_imu_wait_ms * 1e-3, synchroniser, report
-            )
+            self._watch = ImuWatch(config.smoother.max_gated_s, self._clock, synchroniser, report)
+        elif isinstance(estimator, MonocularEstimator):
+            self._clock_watch = ClockWatch(rig, self._clock, synchroniser)
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._first_ns: int | None = None
 
@@ -59,15 +64,15 @@ class ImuOfFramesets:
     @property
     def warnings(self) -> list[str]:
         """Where the IMU contradicts the rig, a sentence each."""
-        return [] if self._watch is None else self._watch.warnings
+        return self._clock.warnings if self._watch is None else self._watch.warnings
 
     @property
     def clock_shift_s(self) -> float:
-        """See `ImuWatch`."""
-        return 0.0 if self._watch is None else self._watch.clock_shift_s
+        """By how much the IMU's stamps have been found to be later than by the rig's time offset."""
+        return self._clock.shift_s
 
     def watch(self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult) -> bool:
-        """Leave the IMU out while it contradicts vision.
+        """Leave the IMU out while it contradicts vision; of single cameras, which need it, correct its clock.
 
         Args:
             stamp_ns: Stamp of a frameset, by which the state has been updated.
@@ -75,8 +80,15 @@ class ImuOfFramesets:
             visual: What vision measured there.
 
         Returns:
-            Whether it is left out from now on, or used again.
+            Whether it is left out from now on, or used again, maybe by another clock.
         """
+        if self._clock_watch is not None:
+            assert isinstance(self._estimator, MonocularEstimator)
+            is_corrected = self._clock_watch.update(stamp_ns, visual.sightings, self._estimator.has_pose)
+            if is_corrected:
+                self._estimator.restart_imu(stamp_ns)
+            self._estimator.doubt_imu(stamp_ns, self._clock_watch.is_doubted)
+            return is_corrected
         if self._watch is None:
             return False
         assert isinstance(self._estimator, SmootherEstimator)

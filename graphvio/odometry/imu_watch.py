@@ -10,17 +10,14 @@ corrected.
 from __future__ import annotations
 
 from collections import deque
-from contextlib import suppress
-from dataclasses import replace
 
 from graphvio.backend.imu_match import ImuMatch, VisualStep, match_imu
-from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.motion import PairReport, Quality, RelativeMotion, VisualResult
+from graphvio.odometry.imu_clock import MAX_SHIFT_S, ImuClock
 from graphvio.odometry.synchroniser import Synchroniser
-from graphvio.rig import Rig
 
 _COMPARED_NS = 4_000_000_000  # of rotations
 _MAX_STEP_NS = 500_000_000  # between framesets whose rotation is compared
@@ -29,16 +26,7 @@ _FIRST_WAIT_NS = 1_000_000_000  # until the first one; four times as long each t
 _MAX_WAIT_NS = 60_000_000_000
 _MIN_INLIERS = 20
 _MAX_WITNESSES = 2  # pairs that see the same motion: what misleads one of them does not mislead the other
-_MAX_SHIFT_S = 1.5
 _MIN_SHIFT_S = 0.005  # less is the calibration's
-
-
-def with_late_clock(rig: Rig, seconds: float) -> Rig:
-    """Return a rig whose IMU's stamps are so much later; the same one where a rig file cannot say so."""
-    if rig.imu is not None and seconds:
-        with suppress(RigError):
-            return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + seconds))
-    return rig
 
 
 def _bears_out(report: PairReport) -> bool:
@@ -52,22 +40,18 @@ class ImuWatch:
     Args:
         max_refused_s: Vision of good quality that is refused for longer, within twice the time, is right. Where two
             pairs see the same motion, half of it is enough.
-        max_late_s: A clock that is later is reported, and not corrected: framesets do not wait for so long.
-        synchroniser: Has the samples, and takes corrections of their clock.
+        clock: Takes corrections.
+        synchroniser: Has the samples.
         report: Receives events.
 
     Attributes:
         is_left_out: Whether the IMU is left out now.
-        clock_shift_s: By how much its stamps have been found to be later than by the rig's time offset.
     """
 
-    def __init__(self, max_refused_s: float, max_late_s: float, synchroniser: Synchroniser, report: Report) -> None:
+    def __init__(self, max_refused_s: float, clock: ImuClock, synchroniser: Synchroniser, report: Report) -> None:
         self.is_left_out = False
-        self.clock_shift_s = 0.0
-        self._corrected_s = 0.0  # of it, for this run
-        self._is_too_late = False
         self._max_refused_ns = round(max_refused_s * 1e9)
-        self._max_late_s = max_late_s
+        self._clock = clock
         self._synchroniser = synchroniser
         self._report = report
         self._refused: deque[tuple[int, int]] = deque()  # stamp, and what a refused motion counts, or 0
@@ -81,17 +65,10 @@ class ImuWatch:
     @property
     def warnings(self) -> list[str]:
         """What contradicts the rig, a sentence each."""
-        if self._is_too_late:
-            return [f"IMU: {self._relation}; it is left out, since framesets do not wait for so long"]
-        found = [f"IMU: {self._relation}; corrected for this run"] if self.clock_shift_s else []
-        if self.is_left_out:
+        found = self._clock.warnings
+        if self.is_left_out and not self._clock.is_too_late:
             found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
         return found
-
-    @property
-    def _relation(self) -> str:
-        later = "later" if self.clock_shift_s > 0.0 else "earlier"
-        return f"its stamps are {1e3 * abs(self.clock_shift_s):.0f} ms {later} than by the rig's time offset"
 
     def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> ImuMatch | None:
         """Take a frameset.
@@ -135,29 +112,16 @@ class ImuWatch:
         """Use the IMU again if it moves as the cameras do, now or at another time."""
         self._next_ns = stamp_ns + _CHECK_NS
         steps = [step for step in self._steps if step.begin_ns >= self._since_ns]
-        match = match_imu(steps, self._synchroniser.mean_readings(), _MAX_SHIFT_S)
+        match = match_imu(steps, self._synchroniser.mean_readings(), MAX_SHIFT_S)
         if match is None:
             return None
-        if match.shift_s > self._max_late_s:
-            if not self._is_too_late:
-                self._is_too_late = True
-                self._report_clock(
-                    stamp_ns, match.shift_s, "it stays left out, since framesets do not wait for so long"
-                )
-            return None
         if abs(match.shift_s) < _MIN_SHIFT_S:
+            self._clock.keep()
             self._report(stamp_ns, EventKind.IMU_USED_AGAIN, "it moves as the cameras do")
-        else:
-            self._report_clock(stamp_ns, match.shift_s, "corrected for this run")
-            self._synchroniser.shift_clock(match.shift_s)
-            self._corrected_s = self.clock_shift_s
-        self.clock_shift_s = self._corrected_s
-        self.is_left_out = self._is_too_late = False
+        elif not self._clock.correct(stamp_ns, match.shift_s):
+            return None
+        self.is_left_out = False
         return match
-
-    def _report_clock(self, stamp_ns: int, shift_s: float, what_is_done: str) -> None:
-        self.clock_shift_s = self._corrected_s + shift_s
-        self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, f"{self._relation}; {what_is_done}")
 
     def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:
         """Add the motion since the frameset before; where that is not known, what follows is not compared with it."""

@@ -29,8 +29,8 @@ from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
 from graphvio.odometry.fixed_calibration import FixedCalibration
+from graphvio.odometry.imu_clock import with_late_clock
 from graphvio.odometry.imu_of_framesets import ImuOfFramesets
-from graphvio.odometry.imu_watch import with_late_clock
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.pairs_calibration import PairsCalibration
@@ -236,13 +236,15 @@ class Odometry:
 
     @property
     def refined_rig(self) -> Rig | None:
-        """The rig with the calibration as it is known now, or None where the calibration is not estimated."""
+        """The rig with the calibration as it is known now; None where nothing of it is estimated, or known yet."""
         estimate = self._calibration.estimate
-        return None if estimate is None else with_late_clock(estimate.rig, self.clock_shift_s)
+        if estimate is None and not self.clock_shift_s:
+            return None
+        return with_late_clock(self.rig if estimate is None else estimate.rig, self.clock_shift_s)
 
     @property
     def clock_shift_s(self) -> float:
-        """By how much the IMU's stamps have been found to be later than by the rig's time offset, see `ImuWatch`."""
+        """By how much the IMU's stamps have been found to be later than by the rig's time offset, see `ImuClock`."""
         return self._imu.clock_shift_s
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:

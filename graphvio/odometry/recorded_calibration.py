@@ -16,7 +16,7 @@ from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
 from graphvio.errors import CalibrationError
 from graphvio.measurements.sensors import FrameSet, Measurement
-from graphvio.odometry.imu_watch import with_late_clock
+from graphvio.odometry.imu_clock import with_late_clock
 from graphvio.odometry.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.self_calibration.batch import Batch, calibrate_windows, difference_of

@@ -79,7 +79,10 @@ class SinglesCalibration:
             self._collector.add_sample(sample)
 
     def restart_imu(self) -> None:
-        """Do nothing: there are no windows with samples."""
+        """Forget what was learnt by another clock."""
+        self._estimate, self._was_wrong = None, False
+        self._collector.restart()
+        self._collector.forget_samples()
 
     def with_allowance(self, visual: VisualResult) -> VisualResult:
         """Return what vision measured, as it is: the window allows for errors of the calibration."""
@@ -95,7 +98,7 @@ class SinglesCalibration:
         if self._estimator.epoch != self._epoch:
             self._epoch = self._estimator.epoch
             self._collector.restart()
-        if status is not Status.TRACKING:
+        if status is not Status.TRACKING or not self._estimator.has_pose:  # which a wrong clock may have ended since
             return
         views = views_at(self._frontend, stamp_ns)
         if self._collector.is_keyframe(stamp_ns, views, _KEYFRAME_INTERVAL_S):

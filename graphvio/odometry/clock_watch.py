@@ -1,0 +1,119 @@
+"""Watches whether the IMU of single cameras turns when they do, and corrects its clock where it turns at another time.
+
+Without a pair there is no motion by vision that an IMU could contradict: scale, velocity and gravity come from both
+together, and an IMU of another clock bends the path, or fits no motion. But tracks alone show how a camera turns.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from graphvio.backend.imu_match import VisualStep, match_rates, turn_disagreement
+from graphvio.frontend.turn import turn_between
+from graphvio.geometry import se3
+from graphvio.measurements.motion import Sighting
+from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
+from graphvio.odometry.imu_clock import MAX_SHIFT_S, ImuClock
+from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.rig import Rig
+
+_STEP_NS = 90_000_000  # shortest, over which a turn is measured
+_MAX_STEP_NS = 500_000_000
+_COMPARED = 25  # newest steps
+_COMPARED_WITHOUT_POSE = 10  # to doubt the IMU: nothing is lost then, where it is only a door that opens
+_MAX_DISAGREEMENT = 0.5  # of what errors explain: with a right clock it is 0.1, and 0.3 where the rig file is 8 ms off
+_MAX_SIGN = 0.3  # beyond which the clock is compared
+_CHECK_NS = 250_000_000  # from one comparison to the next
+_SAME_S = 0.005  # of two comparisons
+_MIN_SHIFT_S = 0.015  # that ends an epoch; less is the calibration's
+_MIN_SHIFT_WITHOUT_POSE_S = 0.01
+
+
+class ClockWatch:
+    """Compares the turns of single cameras with those of the gyro.
+
+    Args:
+        rig: Single cameras and an IMU.
+        clock: Takes corrections.
+        synchroniser: Has the samples, and the time offset as it is estimated.
+
+    Attributes:
+        is_doubted: Whether the gyro turns otherwise than the cameras, so that no pose can be right.
+    """
+
+    def __init__(self, rig: Rig, clock: ImuClock, synchroniser: Synchroniser) -> None:
+        assert rig.imu is not None
+        self.is_doubted = False
+        self._rig = rig
+        self._file_offset_s = rig.imu.time_offset_s
+        self._clock = clock
+        self._synchroniser = synchroniser
+        self._steps: deque[VisualStep] = deque(maxlen=_COMPARED)
+        self._before: tuple[int, Mapping[int, Sighting]] = 0, {}
+        self._next_ns = 0  # of the next comparison at all shifts
+        self._found_s: float | None = None  # by the last one
+
+    def update(self, stamp_ns: int, sightings: Mapping[int, Sighting], has_pose: bool) -> bool:
+        """Take a frameset.
+
+        Args:
+            stamp_ns: Its stamp.
+            sightings: What the cameras see.
+            has_pose: Whether a correction would end an epoch.
+
+        Returns:
+            Whether the clock has been corrected: nothing that the IMU has shown until now holds.
+        """
+        judged = _COMPARED if has_pose else _COMPARED_WITHOUT_POSE
+        if not self._add_step(stamp_ns, sightings) or len(self._steps) < judged:
+            return False
+        readings = self._synchroniser.mean_readings()
+        disagreement = turn_disagreement(list(self._steps)[-judged:], readings)
+        if disagreement is not None:
+            self.is_doubted = disagreement > _MAX_DISAGREEMENT
+        is_good = disagreement is None or disagreement < _MAX_SIGN
+        if stamp_ns < self._next_ns or (has_pose and is_good and not self._is_beyond):
+            return False
+        self._next_ns = stamp_ns + _CHECK_NS
+        match = match_rates(self._steps, readings, MAX_SHIFT_S)
+        before_s, self._found_s = self._found_s, None if match is None else match.shift_s
+        if match is None or before_s is None or abs(match.shift_s - before_s) > _SAME_S:
+            return False
+        min_shift_s = _MIN_SHIFT_S if has_pose else _MIN_SHIFT_WITHOUT_POSE_S
+        return (abs(match.shift_s) > min_shift_s or self._is_beyond) and self._correct(stamp_ns, match.shift_s)
+
+    @property
+    def _learnt_s(self) -> float:
+        """What the time offset differs by from the rig file, as it is estimated."""
+        return self._synchroniser.time_offset_s - self._file_offset_s
+
+    @property
+    def _is_beyond(self) -> bool:
+        """Whether that is more than the estimator's samples reach."""
+        return abs(self._learnt_s) > 1e-9 * MAX_TIME_OFFSET_NS
+
+    def _correct(self, stamp_ns: int, shift_s: float) -> bool:
+        """Correct the clock; the time offset that was estimated until now is of the wrong one."""
+        learnt_s = self._learnt_s
+        if not self._clock.correct(stamp_ns, shift_s + learnt_s):
+            return False
+        self._synchroniser.shift_imu(-learnt_s)
+        self._steps.clear()
+        self._found_s, self.is_doubted = None, False
+        return True
+
+    def _add_step(self, stamp_ns: int, sightings: Mapping[int, Sighting]) -> bool:
+        """Add the turn since the last frameset that one was measured from or to, and return whether there is one."""
+        before_ns, before = self._before
+        step_ns = stamp_ns - before_ns
+        if step_ns < _STEP_NS:
+            return False
+        self._before = stamp_ns, sightings
+        then_R_now = turn_between(self._rig, before, sightings) if step_ns < _MAX_STEP_NS else None
+        if then_R_now is None:
+            return False
+        self._steps.append(VisualStep(before_ns, stamp_ns, se3(then_R_now, np.zeros(3))))
+        return True

@@ -1,0 +1,86 @@
+"""The clock of the IMU: by how much it is off beyond what the calibration is for, and its correction."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+from graphvio.errors import RigError
+from graphvio.measurements.events import EventKind, Report
+from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.rig import Rig
+
+MAX_SHIFT_S = 1.5
+"""Largest error of the clock that is looked for."""
+
+
+def with_late_clock(rig: Rig, seconds: float) -> Rig:
+    """Return a rig whose IMU's stamps are so much later; the same one where a rig file cannot say so."""
+    if rig.imu is not None and seconds:
+        with suppress(RigError):
+            return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + seconds))
+    return rig
+
+
+class ImuClock:
+    """What has been found out about the IMU's clock.
+
+    Args:
+        max_late_s: A clock that is later is reported, and not corrected: framesets do not wait for so long.
+        synchroniser: Takes corrections.
+        report: Receives events.
+
+    Attributes:
+        shift_s: By how much its stamps are later than by the rig's time offset.
+        is_too_late: Whether it is not corrected for being so late.
+    """
+
+    def __init__(self, max_late_s: float, synchroniser: Synchroniser, report: Report) -> None:
+        self.shift_s = 0.0
+        self.is_too_late = False
+        self._corrected_s = 0.0  # of it, for this run
+        self._max_late_s = max_late_s
+        self._synchroniser = synchroniser
+        self._report = report
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be corrected in the rig, a sentence or none."""
+        if not self.shift_s:
+            return []
+        return [f"IMU: {self._relation}; {self._what_is_done}"]
+
+    def correct(self, stamp_ns: int, shift_s: float) -> bool:
+        """Correct the clock, where its stamps are so much later than by the last correction.
+
+        Args:
+            stamp_ns: Of the frameset at which it was found.
+            shift_s: Seconds.
+
+        Returns:
+            Whether it is corrected; where it is too late, that is reported once.
+        """
+        was_too_late, self.is_too_late = self.is_too_late, shift_s > self._max_late_s
+        self.shift_s = self._corrected_s + shift_s
+        if not (was_too_late and self.is_too_late):
+            self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, f"{self._relation}; {self._what_is_done}")
+        if self.is_too_late:
+            return False
+        self._synchroniser.shift_clock(shift_s)
+        self._corrected_s = self.shift_s
+        return True
+
+    def keep(self) -> None:
+        """Take note that the clock is right as it is corrected now."""
+        self.shift_s, self.is_too_late = self._corrected_s, False
+
+    @property
+    def _relation(self) -> str:
+        later = "later" if self.shift_s > 0.0 else "earlier"
+        return f"its stamps are {1e3 * abs(self.shift_s):.0f} ms {later} than by the rig's time offset"
+
+    @property
+    def _what_is_done(self) -> str:
+        return (
+            "it is not used, since framesets do not wait for so long" if self.is_too_late else "corrected for this run"
+        )
