@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float
-from graphvio.backend.imu_match import VisualStep, match_imu
+from graphvio.backend.imu_match import VisualStep, match_imu, match_rates, turn_disagreement
 from graphvio.backend.inertial import ImuBuffer, MeanReadings
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
@@ -144,3 +144,35 @@ def test_mean_readings_are_those_of_the_intervals_and_nan_in_gaps() -> None:
         np.testing.assert_allclose(found[k], np.concatenate([interval.mean_rate, interval.mean_force]), atol=1e-9)
     assert np.isnan(found[[1, 3]]).all()
     assert np.isnan(ImuBuffer(50.0).means().between(begins, ends)).all()
+
+
+@pytest.mark.parametrize("late_s", [0.0, -0.0137, 0.1])
+def test_match_rates_needs_no_translations(late_s: float) -> None:
+    turns = [each._replace(begin_T_end=se3(each.begin_T_end[:3, :3].copy(), np.zeros(3))) for each in steps(2.5)]
+    found = match_rates(turns, readings(late_s), MAX_SHIFT_S)
+    assert found is not None
+    assert found.shift_s == pytest.approx(late_s, abs=0.001)
+
+
+def test_turn_disagreement_grows_with_the_error_of_the_clock() -> None:
+    """It is in multiples of what errors of both explain: well below one by the right clock."""
+    found = [turn_disagreement(steps(1.5, noise=1e-4), readings(late_s)) for late_s in (0.0, 0.03, 0.1)]
+    at_once, little, much = (value for value in found if value is not None)
+    assert at_once < 0.1
+    assert 2.0 * at_once < little < 0.6 * much
+    assert much > 1.0
+
+
+def test_turn_disagreement_is_not_that_of_a_few_wrong_turns() -> None:
+    wrong = steps(1.5)
+    for k in range(0, len(wrong), 3):
+        turned = wrong[k].begin_T_end @ se3(so3_exp(np.array([0.2, 0.0, 0.0])), np.zeros(3))
+        wrong[k] = wrong[k]._replace(begin_T_end=turned)
+    disagreement = turn_disagreement(wrong, readings(0.0))
+    assert disagreement is not None
+    assert disagreement < 0.3
+
+
+def test_turn_disagreement_without_turns_or_samples_is_unknown() -> None:
+    assert turn_disagreement(steps(1.5, still=True), readings(0.0)) is None
+    assert turn_disagreement(steps(8.0), readings(0.0)) is None

@@ -16,6 +16,7 @@ from graphvio.evaluation import evaluate
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
+from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
@@ -31,11 +32,16 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded(tmp_path_factory.mktemp("watch") / "walk", SECONDS)
 
 
+def with_cameras(walk: Path, cameras: list[str] | None) -> Source:
+    source = open_source(walk)
+    return source if cameras is None else open_source(walk, source.rig.with_only(cameras).without_pairs())
+
+
 class Walked:
     """The odometry at the end of a walk with a fault of the IMU, its events, and its error."""
 
-    def __init__(self, walk: Path, change: Change) -> None:
-        source = open_source(walk)
+    def __init__(self, walk: Path, change: Change, cameras: list[str] | None = None) -> None:
+        source = with_cameras(walk, cameras)
         assert source.truth is not None
         measurements = list(source)
         first_ns = next(each.stamp_ns for each in measurements if isinstance(each, FrameSet))
@@ -49,13 +55,15 @@ class Walked:
         estimates = [each for each in map(self.odometry.process, faulty) if each is not None]
         estimates += self.odometry.finish()
         posed = [each for each in estimates if each.nav_T_body is not None]
-        self.epochs = {each.epoch for each in estimates}
+        self.epochs = {each.epoch for each in posed}
         self.last_status = estimates[-1].status
         self.events = Counter(event.kind for event in self.odometry.take_events())
+        newest = [each for each in posed if each.epoch == max(self.epochs)]
+        self.newest_poses = len(newest)
         estimated = Trajectory(
-            np.array([each.stamp_ns for each in posed]), np.array([each.nav_T_body for each in posed])
+            np.array([each.stamp_ns for each in newest]), np.array([each.nav_T_body for each in newest])
         )
-        self.error_m = evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse
+        self.error_m = evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse  # of the newest epoch
 
 
 def late(seconds: float, since_s: float = -np.inf) -> Change:
@@ -136,3 +144,63 @@ def test_imu_that_is_right_is_not_left_out(walk: Path) -> None:
     walked = Walked(walk, lambda sample, _: sample)
     assert not walked.events & Counter([LEFT_OUT, USED_AGAIN, CLOCK_OFF])
     assert walked.odometry.clock_shift_s == 0.0
+
+
+@pytest.mark.parametrize("seconds", [0.05, -0.1])
+def test_clock_of_a_single_cameras_imu_is_corrected_before_the_first_pose(long_room_walk: Path, seconds: float) -> None:
+    walked = Walked(long_room_walk, late(seconds), ["cam0"])
+    assert walked.events[CLOCK_OFF] == 1
+    assert walked.epochs == {0}
+    assert walked.odometry.clock_shift_s == pytest.approx(seconds, abs=0.003)
+    assert walked.newest_poses > 60
+    assert walked.error_m < 0.02
+    shift = f"{1e3 * abs(walked.odometry.clock_shift_s):.0f} ms"
+    assert any(shift in warning for warning in walked.odometry.rig_warnings)
+    refined = walked.odometry.refined_rig
+    assert refined is not None
+    assert refined.imu is not None
+    assert refined.imu.time_offset_s == pytest.approx(seconds, abs=0.002)
+
+
+def test_clock_of_a_single_cameras_imu_that_jumps_is_corrected(long_room_walk: Path) -> None:
+    walked = Walked(long_room_walk, late(-0.06, FAULT_S), ["cam0"])
+    assert (walked.events[EventKind.LOST], walked.events[CLOCK_OFF]) == (1, 1)
+    assert walked.odometry.clock_shift_s == pytest.approx(-0.06, abs=0.005)
+
+
+def test_clock_of_a_single_cameras_imu_that_is_too_late_is_in_the_refined_rig(long_room_walk: Path) -> None:
+    source = with_cameras(long_room_walk, ["cam0"])
+    odometry = Odometry(source.rig)
+    measurements = [late(0.3)(each, 0.0) if isinstance(each, ImuSample) else each for each in source]
+    for each in sorted(measurements, key=lambda each: each.stamp_ns):
+        estimate = odometry.process(each)
+        assert estimate is None or estimate.nav_T_body is None
+    assert [event.kind for event in odometry.take_events()].count(CLOCK_OFF) == 1
+    assert odometry.refined_rig is not None
+    assert odometry.refined_rig.imu is not None
+    assert odometry.refined_rig.imu.time_offset_s == pytest.approx(0.3, abs=0.003)
+
+
+def test_single_camera_has_no_pose_by_an_imu_of_other_axes(long_room_walk: Path) -> None:
+    """It would be wrong; where the rig does not turn, that cannot be seen."""
+    z90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    source = with_cameras(long_room_walk, ["cam0"])
+    odometry = Odometry(source.rig)
+    posed = 0
+    for each in source:
+        if isinstance(each, ImuSample):
+            each = replace(
+                each, angular_velocity=z90 @ each.angular_velocity, linear_acceleration=z90 @ each.linear_acceleration
+            )
+        estimate = odometry.process(each)
+        posed += estimate is not None and estimate.nav_T_body is not None
+    assert not posed
+    (event,) = [event for event in odometry.take_events() if event.kind is EventKind.NOT_INITIALISED]
+    assert "axes" in event.detail
+
+
+def test_clock_of_a_single_cameras_imu_that_is_right_is_kept(long_room_walk: Path) -> None:
+    walked = Walked(long_room_walk, lambda sample, _: sample, ["cam0"])
+    assert not walked.events & Counter([CLOCK_OFF, EventKind.LOST])
+    assert walked.odometry.clock_shift_s == 0.0
+    assert walked.epochs == {0}

@@ -42,10 +42,12 @@ class RateMatch(NamedTuple):
     Attributes:
         shift_s: By how many seconds its stamps are late.
         gyro_bias: (3,) rad/s.
+        difference: RMS of the rates' difference at this shift, as a share of what errors of both explain.
     """
 
     shift_s: float
     gyro_bias: Float
+    difference: float
 
 
 class ImuMatch(NamedTuple):
@@ -78,13 +80,13 @@ def match_imu(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: 
     if found is None:
         return None
     gravity_body = _gravity(steps, readings, round(found.shift_s * 1e9))
-    return None if gravity_body is None else ImuMatch(*found, gravity_body)
+    return None if gravity_body is None else ImuMatch(found.shift_s, found.gyro_bias, gravity_body)
 
 
 def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> RateMatch | None:
     """Find the only shift of its stamps at which the gyro turns as the cameras do; see `match_imu`.
 
-    Translations are not used.
+    Steps may overlap or be apart, and translations are not used.
     """
     if not steps:
         return None
@@ -100,7 +102,8 @@ def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s
     if (differences[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
         return None
     shift_s = float(shifts[best]) + _beyond(differences[best - 1 : best + 2])
-    return RateMatch(shift_s, compared.errors[best][compared.is_known[best]].mean(axis=0))
+    gyro_bias = compared.errors[best][compared.is_known[best]].mean(axis=0)
+    return RateMatch(shift_s, gyro_bias, least / compared.tolerance(best))
 
 
 def turn_disagreement(steps: Sequence[VisualStep], readings: MeanReadings) -> float | None:
@@ -126,11 +129,13 @@ class _Compared(NamedTuple):
     differences: Float  # (S,) RMS of the errors about their mean, rad/s; infinite where too few are known
     changes: Float  # (S,) the same of vision's rates
 
+    def tolerance(self, at: int) -> float:
+        """Return what errors of vision and gyro explain of the difference at a shift, rad/s."""
+        return _RATE_NOISE_RAD_S + _ERROR_SHARE * float(self.changes[at])
+
     def is_alike(self, at: int) -> bool:
         """Whether the rates change, and do so together, at a shift."""
-        change = float(self.changes[at])
-        tolerance = _RATE_NOISE_RAD_S + _ERROR_SHARE * change
-        return change >= _MIN_CHANGE_RAD_S and float(self.differences[at]) <= tolerance
+        return bool(self.changes[at] >= _MIN_CHANGE_RAD_S and self.differences[at] <= self.tolerance(at))
 
 
 def _compared(steps: Sequence[VisualStep], readings: MeanReadings, shifts: Float) -> _Compared:

@@ -16,9 +16,10 @@ from graphvio.rig import Rig
 _MIN_TRACKS = 30
 _MIN_FITTING = 0.5  # share of the tracks
 _MAX_SLOPE = 1.5  # of rays: those of wide lenses beyond have errors many times as large in the image plane
-_SIGMA_PX = 1.0
+_MAX_OFF_PX = 0.5
 _CONFIDENCE = 0.999
-_MAX_IN_PLANE = 0.9  # share of the tracks that fit: a plane has two essential matrices, with different rotations
+_MAX_OFF_PLANE_PX = 0.7
+_MAX_IN_PLANE = 0.85  # share of the tracks that fit: a plane has two essential matrices, with different rotations
 
 
 def turn_between(rig: Rig, then: Mapping[int, Sighting], now: Mapping[int, Sighting]) -> Float | None:
@@ -39,14 +40,16 @@ def turn_between(rig: Rig, then: Mapping[int, Sighting], now: Mapping[int, Sight
     first, second = tracks[camera]
     if len(first) < _MIN_TRACKS:
         return None
-    threshold = _SIGMA_PX / rig.cameras[camera].focal_px
+    focal_px = rig.cameras[camera].focal_px
     essential, fits = cv2.findEssentialMat(
-        first, second, np.eye(3), method=cv2.USAC_ACCURATE, prob=_CONFIDENCE, threshold=threshold
+        first, second, np.eye(3), method=cv2.USAC_ACCURATE, prob=_CONFIDENCE, threshold=_MAX_OFF_PX / focal_px
     )
     fitting = np.count_nonzero(fits)
     if essential is None or essential.shape != (3, 3) or fitting < _MIN_FITTING * len(first):
         return None
-    _, in_plane = cv2.findHomography(first, second, cv2.USAC_ACCURATE, threshold, confidence=_CONFIDENCE)
+    _, in_plane = cv2.findHomography(
+        first, second, cv2.USAC_ACCURATE, _MAX_OFF_PLANE_PX / focal_px, confidence=_CONFIDENCE
+    )
     if np.count_nonzero(in_plane) > _MAX_IN_PLANE * fitting:
         return None
     # Of the two rotations that explain it, one has half a turn more.

@@ -20,12 +20,14 @@ from graphvio.odometry.imu_clock import MAX_SHIFT_S, ImuClock
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
-_STEP_NS = 90_000_000  # shortest, over which a turn is measured
+_INTERVAL_NS = 90_000_000  # from one step to the next
+_STEP_NS = 190_000_000  # over which a turn is measured, the interval where tracks are too short for that
 _MAX_STEP_NS = 500_000_000
 _COMPARED = 25  # newest steps
 _COMPARED_WITHOUT_POSE = 10  # to doubt the IMU: nothing is lost then, where it is only a door that opens
 _MAX_DISAGREEMENT = 0.5  # of what errors explain: with a right clock it is 0.1, and 0.3 where the rig file is 8 ms off
 _MAX_SIGN = 0.3  # beyond which the clock is compared
+_MAX_DIFFERENCE = 0.4  # of a comparison, likewise: it is larger where the clock has jumped between the steps
 _CHECK_NS = 250_000_000  # from one comparison to the next
 _SAME_S = 0.005  # of two comparisons
 _MIN_SHIFT_S = 0.015  # that ends an epoch; less is the calibration's
@@ -52,7 +54,7 @@ class ClockWatch:
         self._clock = clock
         self._synchroniser = synchroniser
         self._steps: deque[VisualStep] = deque(maxlen=_COMPARED)
-        self._before: tuple[int, Mapping[int, Sighting]] = 0, {}
+        self._seen: deque[tuple[int, Mapping[int, Sighting]]] = deque()  # at instants that a step may begin with
         self._next_ns = 0  # of the next comparison at all shifts
         self._found_s: float | None = None  # by the last one
 
@@ -79,6 +81,8 @@ class ClockWatch:
             return False
         self._next_ns = stamp_ns + _CHECK_NS
         match = match_rates(self._steps, readings, MAX_SHIFT_S)
+        if match is not None and match.difference > _MAX_DIFFERENCE:
+            match = None
         before_s, self._found_s = self._found_s, None if match is None else match.shift_s
         if match is None or before_s is None or abs(match.shift_s - before_s) > _SAME_S:
             return False
@@ -106,14 +110,15 @@ class ClockWatch:
         return True
 
     def _add_step(self, stamp_ns: int, sightings: Mapping[int, Sighting]) -> bool:
-        """Add the turn since the last frameset that one was measured from or to, and return whether there is one."""
-        before_ns, before = self._before
-        step_ns = stamp_ns - before_ns
-        if step_ns < _STEP_NS:
+        """Add the turn over the newest step, if it is due, and return whether there is one."""
+        if self._seen and stamp_ns - self._seen[-1][0] < _INTERVAL_NS:
             return False
-        self._before = stamp_ns, sightings
-        then_R_now = turn_between(self._rig, before, sightings) if step_ns < _MAX_STEP_NS else None
-        if then_R_now is None:
-            return False
-        self._steps.append(VisualStep(before_ns, stamp_ns, se3(then_R_now, np.zeros(3))))
-        return True
+        self._seen.append((stamp_ns, sightings))
+        while len(self._seen) > 1 and stamp_ns - self._seen[1][0] >= _STEP_NS:
+            self._seen.popleft()
+        for begin_ns, then in list(self._seen)[:-1]:
+            then_R_now = turn_between(self._rig, then, sightings) if stamp_ns - begin_ns < _MAX_STEP_NS else None
+            if then_R_now is not None:
+                self._steps.append(VisualStep(begin_ns, stamp_ns, se3(then_R_now, np.zeros(3))))
+                return True
+        return False
