@@ -109,13 +109,13 @@ def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s
 def turn_disagreement(steps: Sequence[VisualStep], readings: MeanReadings) -> float | None:
     """Return how far apart gyro and cameras turn by the gyro's stamps, as a multiple of what errors of both explain.
 
-    It is the median of the steps, so that a few that vision got wrong do not count. None where the IMU does not cover
-    them, or the rig hardly turns.
+    It is the median of the steps (at least one), so that a few that vision got wrong do not count. None where the IMU
+    does not cover them, or the rig hardly turns.
     """
     begins_ns, ends_ns, rates = _rates(steps)
     errors = readings.between(begins_ns, ends_ns)[:, :3] - rates
     change = _spread(rates)
-    if not len(steps) or np.isnan(errors).any() or change < _MIN_CHANGE_RAD_S:
+    if np.isnan(errors).any() or change < _MIN_CHANGE_RAD_S:
         return None
     apart = np.linalg.norm(errors - np.median(errors, axis=0), axis=1)
     return float(np.median(apart)) / (_RATE_NOISE_RAD_S + _ERROR_SHARE * change)

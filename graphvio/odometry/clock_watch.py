@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphvio.backend.imu_match import VisualStep, match_rates, turn_disagreement
+from graphvio.backend.inertial import MeanReadings
 from graphvio.frontend.turn import turn_between
 from graphvio.geometry import se3
 from graphvio.measurements.motion import Sighting
@@ -24,8 +25,9 @@ _INTERVAL_NS = 90_000_000  # from one step to the next
 _STEP_NS = 190_000_000  # over which a turn is measured, the interval where tracks are too short for that
 _MAX_STEP_NS = 500_000_000
 _COMPARED = 25  # newest steps
-_COMPARED_WITHOUT_POSE = 10  # to doubt the IMU: nothing is lost then, where it is only a door that opens
-_MAX_DISAGREEMENT = 0.5  # of what errors explain: with a right clock it is 0.1, and 0.3 where the rig file is 8 ms off
+_JUDGED_WITHOUT_POSE = 10  # of them: nothing is lost where it is only a door that opens
+_MAX_DISAGREEMENT = 1.0  # of what errors explain: with a right clock it is 0.1, and 0.3 where it is 8 ms off
+_MAX_DISAGREEMENT_AT_FIRST = 0.5  # until there are steps enough to be compared
 _MAX_SIGN = 0.3  # beyond which the clock is compared
 _MAX_DIFFERENCE = 0.4  # of a comparison, likewise: it is larger where the clock has jumped between the steps
 _CHECK_NS = 250_000_000  # from one comparison to the next
@@ -69,25 +71,33 @@ class ClockWatch:
         Returns:
             Whether the clock has been corrected: nothing that the IMU has shown until now holds.
         """
-        judged = _COMPARED if has_pose else _COMPARED_WITHOUT_POSE
+        judged = _COMPARED if has_pose else _JUDGED_WITHOUT_POSE
         if not self._add_step(stamp_ns, sightings) or len(self._steps) < judged:
             return False
         readings = self._synchroniser.mean_readings()
         disagreement = turn_disagreement(list(self._steps)[-judged:], readings)
-        if disagreement is not None:
-            self.is_doubted = disagreement > _MAX_DISAGREEMENT
         is_good = disagreement is None or disagreement < _MAX_SIGN
-        if stamp_ns < self._next_ns or (has_pose and is_good and not self._is_beyond):
-            return False
-        self._next_ns = stamp_ns + _CHECK_NS
-        match = match_rates(self._steps, readings, MAX_SHIFT_S)
-        if match is not None and match.difference > _MAX_DIFFERENCE:
-            match = None
-        before_s, self._found_s = self._found_s, None if match is None else match.shift_s
-        if match is None or before_s is None or abs(match.shift_s - before_s) > _SAME_S:
-            return False
+        shift_s = None
+        if stamp_ns >= self._next_ns and not (has_pose and is_good and not self._is_beyond):
+            self._next_ns = stamp_ns + _CHECK_NS
+            shift_s = self._confirmed_shift_s(readings)
         min_shift_s = _MIN_SHIFT_S if has_pose else _MIN_SHIFT_WITHOUT_POSE_S
-        return (abs(match.shift_s) > min_shift_s or self._is_beyond) and self._correct(stamp_ns, match.shift_s)
+        if shift_s is not None and (abs(shift_s) > min_shift_s or self._is_beyond):
+            return self._correct(stamp_ns, shift_s)
+        is_calibrations = self._found_s is not None and abs(self._found_s) <= min_shift_s
+        if disagreement is not None:
+            limit = _MAX_DISAGREEMENT if len(self._steps) == _COMPARED else _MAX_DISAGREEMENT_AT_FIRST
+            self.is_doubted = disagreement > limit and not is_calibrations
+        return False
+
+    def _confirmed_shift_s(self, readings: MeanReadings) -> float | None:
+        """Return the shift at which the gyro turns as the cameras do, if the last comparison has found the same."""
+        match = match_rates(self._steps, readings, MAX_SHIFT_S)
+        before_s, self._found_s = self._found_s, None
+        if match is None or match.difference > _MAX_DIFFERENCE:
+            return None
+        self._found_s = match.shift_s
+        return match.shift_s if before_s is not None and abs(match.shift_s - before_s) < _SAME_S else None
 
     @property
     def _learnt_s(self) -> float:
