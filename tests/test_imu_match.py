@@ -31,12 +31,20 @@ def pose(t: float) -> Float:
     return se3(so3_exp(angles(t)), position(t))
 
 
-def steps(duration_s: float, noise: float = 0.0, still: bool = False) -> list[VisualStep]:
+def steps(
+    duration_s: float, noise: float = 0.0, still: bool = False, noise_m: float = 0.0, rate_hz: int = FRAMES_HZ
+) -> list[VisualStep]:
+    """Steps with noise of turns, radians, and of positions."""
     rng = np.random.default_rng(3)
     made = []
-    for k in range(round(duration_s * FRAMES_HZ)):
-        begin_s, end_s = k / FRAMES_HZ, (k + 1) / FRAMES_HZ
-        motion = np.eye(4) if still else se3_inverse(pose(begin_s)) @ pose(end_s)
+    off = np.zeros(3)
+    for k in range(round(duration_s * rate_hz)):
+        begin_s, end_s = k / rate_hz, (k + 1) / rate_hz
+        begin, end = pose(begin_s), pose(end_s)
+        begin[:3, 3] += off
+        off = noise_m * rng.standard_normal(3)
+        end[:3, 3] += off
+        motion = np.eye(4) if still else se3_inverse(begin) @ end
         motion[:3, :3] = motion[:3, :3] @ so3_exp(noise * rng.standard_normal(3))
         made.append(VisualStep(FIRST_NS + round(begin_s * 1e9), FIRST_NS + round(end_s * 1e9), motion))
     return made
@@ -70,6 +78,19 @@ def test_match_imu_is_that_of_the_clock(late_s: float) -> None:
     np.testing.assert_allclose(found.gravity_body, down, atol=0.2)
 
 
+@pytest.mark.parametrize("rate_hz", [20, 30, 60])
+@pytest.mark.parametrize("late_s", [0.0, 0.1])
+def test_match_imu_with_noise_of_positions_is_that_of_the_clock(rate_hz: int, late_s: float) -> None:
+    found = match_imu(steps(3.5, noise_m=0.003, rate_hz=rate_hz), readings(late_s), MAX_SHIFT_S)
+    assert found is not None
+    assert found.shift_s == pytest.approx(late_s, abs=0.001)
+
+
+def test_match_rates_at_the_edge_of_the_samples_is_none() -> None:
+    """Where they end, the smallest difference of those that are known need not be a minimum."""
+    assert match_rates(steps(2.1), readings(0.08, until_s=2.1 - 0.08), MAX_SHIFT_S) is None
+
+
 def scaled(gyro: float = 1.0, force: float = 1.0) -> Callable[[Float], Float]:
     return lambda values: values * np.repeat([gyro, force], 3)
 
@@ -87,6 +108,7 @@ def scaled(gyro: float = 1.0, force: float = 1.0) -> Callable[[Float], Float]:
 )
 def test_match_imu_of_an_imu_that_is_not_the_rigs_is_none(change: Callable[[Float], Float]) -> None:
     assert match_imu(steps(3.5), readings(0.0, change), MAX_SHIFT_S) is None
+    assert match_imu(steps(3.5, noise_m=0.002), readings(0.0, change), MAX_SHIFT_S) is None
 
 
 def test_match_imu_without_turns_or_time_is_none() -> None:

@@ -23,6 +23,7 @@ _LOBE_S = 0.1  # shifts that are closer are of the same minimum
 _DISTINCT = 2.0  # times the least difference that all other shifts must have
 _MIN_CHANGE_RAD_S = 0.1  # of the rates, RMS about their mean: with less, one shift fits as well as another
 _RATE_NOISE_RAD_S = 0.02
+_AVERAGED_S = 0.2  # twice
 _FORCE_NOISE_M_S2 = 0.5  # and bias
 _ERROR_SHARE = 0.1  # of the change: errors of the calibration, and of means over a step
 _MAX_GRAVITY_ERROR_M_S2 = 1.0
@@ -96,7 +97,9 @@ def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s
     differences = compared.differences
     best = int(np.argmin(differences))
     least = float(differences[best])
-    if not 0 < best < 2 * count or not compared.is_alike(best):
+    if not 0 < best < 2 * count or not np.isfinite(differences[best - 1 : best + 2]).all():  # at the edge of a range
+        return None
+    if not compared.is_alike(best):
         return None
     others: Bool = np.abs(shifts - shifts[best]) > _LOBE_S
     if (differences[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
@@ -173,13 +176,22 @@ def _gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int)
             accelerations.append(acceleration)
     if len(against_gravity) < _MIN_STEPS:
         return None
-    mean, change = np.mean(against_gravity, axis=0), _spread(np.array(accelerations))
+    # Second differences of positions of framesets are mostly noise: their means over some tenths of a second are not.
+    count = max(round(_AVERAGED_S * 1e9 / float(np.median(np.diff(middles_ns)))), 1)
+    mean, change = np.mean(against_gravity, axis=0), _spread(_averaged(np.array(accelerations), count))
     if abs(np.linalg.norm(mean) - GRAVITY_M_S2) > _MAX_GRAVITY_ERROR_M_S2:
         return None
-    if _spread(np.array(against_gravity)) > _FORCE_NOISE_M_S2 + _ERROR_SHARE * change:
+    if _spread(_averaged(np.array(against_gravity), count)) > _FORCE_NOISE_M_S2 + _ERROR_SHARE * change:
         return None
     first_R_end = first_R_end @ steps[-1].begin_T_end[:3, :3]
     return np.asarray(-GRAVITY_M_S2 * (first_R_end.T @ mean) / np.linalg.norm(mean))
+
+
+def _averaged(vectors: Float, count: int) -> Float:
+    """Return means (M, 3) over so many successive vectors (N, 3), of such means."""
+    for _ in range(2):
+        vectors = np.lib.stride_tricks.sliding_window_view(vectors, min(count, len(vectors)), axis=0).mean(axis=-1)
+    return vectors
 
 
 def _spread(vectors: Float) -> float:

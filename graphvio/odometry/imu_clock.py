@@ -60,8 +60,8 @@ class ImuClock:
         Returns:
             Whether it is corrected; where it is too late, that is reported once.
         """
-        was_too_late, self.is_too_late = self.is_too_late, shift_s > self._max_late_s
         self.shift_s = self._corrected_s + shift_s
+        was_too_late, self.is_too_late = self.is_too_late, self.shift_s > self._max_late_s
         if not (was_too_late and self.is_too_late):
             self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, f"{self._relation}; {self._what_is_done}")
         if self.is_too_late:
