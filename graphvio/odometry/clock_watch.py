@@ -22,7 +22,7 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
 _INTERVAL_NS = 90_000_000  # from one step to the next
-_STEP_NS = 190_000_000  # over which a turn is measured, the interval where tracks are too short for that
+_STEP_NS = 190_000_000  # over which a turn is measured; where tracks are too short for that, over less
 _MAX_STEP_NS = 500_000_000
 _COMPARED = 25  # newest steps
 _JUDGED_WITHOUT_POSE = 10  # of them: nothing is lost where it is only a door that opens
