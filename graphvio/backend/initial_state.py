@@ -104,7 +104,7 @@ def after_failure(stamp_ns: int, state: RigState, covariance: StateCovariance) -
 
 def after_gap(stamp_ns: int, state: RigState, covariance: StateCovariance) -> InitialState:
     """Begin an epoch at the last state, after a gap that nothing bridges; arguments as for `after_failure`."""
-    return _of_new_epoch(stamp_ns, state, covariance.pose + AFTER_JUMP, covariance.gravity)
+    return _at_kept_pose(stamp_ns, state, covariance.pose + AFTER_JUMP, covariance.gravity)
 
 
 def after_lost(motion: RelativeMotion, state: RigState, covariance: StateCovariance) -> InitialState:
@@ -115,7 +115,7 @@ def after_lost(motion: RelativeMotion, state: RigState, covariance: StateCovaria
         state: The prediction.
         covariance: Of the prediction.
     """
-    return _of_new_epoch(motion.stamp_ns, _with_velocity(state, motion), covariance.pose, covariance.gravity)
+    return _at_kept_pose(motion.stamp_ns, _with_velocity(state, motion), covariance.pose, covariance.gravity)
 
 
 def from_vision(
@@ -159,7 +159,7 @@ def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covar
         accel_bias=np.zeros(3),
         gravity_nav=state.nav_T_body[:3, :3] @ match.gravity_body,
     )
-    initial = with_wide_attitude(_reinitialised(motion.stamp_ns, state, covariance.pose, covariance.gravity))
+    initial = with_wide_attitude(_at_kept_pose(motion.stamp_ns, state, covariance.pose, covariance.gravity))
     return replace(initial, is_known=True)
 
 
@@ -173,10 +173,10 @@ def with_wide_attitude(initial: InitialState) -> InitialState:
     return with_free_gravity(replace(initial, uncertainty=uncertainty, is_known=False))
 
 
-def _of_new_epoch(
+def _at_kept_pose(
     stamp_ns: int, state: RigState, pose_covariance: Float, gravity_covariance: Float | None
 ) -> InitialState:
-    # The pose defines the epoch's nav: its uncertainty is reported, but nothing is estimated of it.
+    # The pose defines nav from now on: its uncertainty is reported, but nothing is estimated of it.
     initial = with_free_gravity(_reinitialised(stamp_ns, state, pose_covariance, gravity_covariance))
     return replace(initial, uncertainty=replace(initial.uncertainty, of_nav=pose_covariance))
 

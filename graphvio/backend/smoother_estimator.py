@@ -214,6 +214,7 @@ class SmootherEstimator:
         try:
             initial = with_new_imu(motion, match, self.state(), self.covariance)
             self._reinitialise(initial, self.latest_ns - 1)
+            self.covariance = self._running.state_covariance()
         except SOLVER_ERRORS as error:
             self._rebuild(self.latest_ns, self.state(), error)
 
@@ -316,13 +317,14 @@ class SmootherEstimator:
     def _reinitialise_from_vision(self, motion: RelativeMotion, why: str) -> None:
         """Take the pose from refused motions that go on agreeing with each other: the prediction is at fault.
 
-        Their chain begins at a state that was accepted. Unless the IMU is known to have failed, the pose is uncertain
-        by as much as it differs from the prediction.
+        Their chain begins at a state that was accepted. Unless the IMU is known to have failed at that moment, the pose
+        is uncertain by as much as it differs from the prediction.
         """
         smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
         predicted = smoother.state()
+        has_failed = self._imu_failed and not self._is_imu_left_out
         initial = from_vision(
-            motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity, self._imu_failed
+            motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity, has_failed
         )
         self._reinitialise(initial, self._tracked_ns)
         apart_m = np.linalg.norm(se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)[3:])

@@ -82,8 +82,10 @@ class ClockWatch:
             self._next_ns = stamp_ns + _CHECK_NS
             shift_s = self._confirmed_shift_s(readings)
         min_shift_s = _MIN_SHIFT_S if has_pose else _MIN_SHIFT_WITHOUT_POSE_S
-        if shift_s is not None and (abs(shift_s) > min_shift_s or self._is_beyond):
-            return self._correct(stamp_ns, shift_s)
+        if shift_s is not None:
+            if abs(shift_s) > min_shift_s or self._is_beyond:
+                return self._correct(stamp_ns, shift_s)
+            self._clock.keep()
         is_calibrations = self._found_s is not None and abs(self._found_s) <= min_shift_s
         if disagreement is not None:
             limit = _MAX_DISAGREEMENT if len(self._steps) == _COMPARED else _MAX_DISAGREEMENT_AT_FIRST

@@ -13,7 +13,7 @@ from graphvio.config import Config
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import VisualResult
+from graphvio.measurements.motion import RelativeMotion, VisualResult
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.clock_watch import ClockWatch
 from graphvio.odometry.imu_clock import ImuClock
@@ -71,13 +71,16 @@ class ImuOfFramesets:
         """By how much the IMU's stamps have been found to be later than by the rig's time offset."""
         return self._clock.shift_s
 
-    def watch(self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult) -> bool:
+    def watch(
+        self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult, applied: RelativeMotion | None
+    ) -> bool:
         """Leave the IMU out while it contradicts vision; of single cameras, which need it, correct its clock.
 
         Args:
             stamp_ns: Stamp of a frameset, by which the state has been updated.
             interval: The IMU before it that has been used, or None.
             visual: What vision measured there.
+            applied: The motion of it that the state has been updated by, or None.
 
         Returns:
             Whether it is left out from now on, or used again, maybe by another clock.
@@ -94,9 +97,9 @@ class ImuOfFramesets:
         assert isinstance(self._estimator, SmootherEstimator)
         was_left_out = self.is_left_out
         gate_result = None if interval is None else self._estimator.gate_results.get("vision")
-        match = self._watch.update(stamp_ns, visual, gate_result)
-        if match is not None and visual.motion is not None:
-            self._estimator.use_imu_again(visual.motion, match)
+        match = self._watch.update(stamp_ns, visual, gate_result, is_applied=applied is not None)
+        if match is not None and applied is not None:
+            self._estimator.use_imu_again(applied, match)
         if self.is_left_out and not was_left_out:
             self._estimator.leave_imu_out()
         return self.is_left_out != was_left_out

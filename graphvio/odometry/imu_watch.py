@@ -24,6 +24,7 @@ _MAX_STEP_NS = 500_000_000  # between framesets whose rotation is compared
 _CHECK_NS = 1_000_000_000  # from one comparison to the next
 _FIRST_WAIT_NS = 1_000_000_000  # until the first one; four times as long each time
 _MAX_WAIT_NS = 60_000_000_000
+_TRUSTED_AGAIN = 10  # waits that it was right for, after which the next one is as short as the first
 _MIN_INLIERS = 20
 _MAX_WITNESSES = 2  # pairs that see the same motion: what misleads one of them does not mislead the other
 _MIN_SHIFT_S = 0.005  # less is the calibration's
@@ -61,6 +62,7 @@ class ImuWatch:
         self._since_ns = 0  # first refused motion
         self._next_ns = 0  # of the next comparison
         self._wait_ns = _FIRST_WAIT_NS
+        self._used_since_ns = 0  # it was left out until then
 
     @property
     def warnings(self) -> list[str]:
@@ -70,13 +72,16 @@ class ImuWatch:
             found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
         return found
 
-    def update(self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None) -> ImuMatch | None:
+    def update(
+        self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None, is_applied: bool
+    ) -> ImuMatch | None:
         """Take a frameset.
 
         Args:
             stamp_ns: Its stamp.
             visual: What vision measured.
             gate_result: Of the test against a prediction by the IMU; None where there was none.
+            is_applied: Whether the state has been updated by a motion of vision.
 
         Returns:
             How the IMU moves where it is used again, maybe by another clock: what the state has of its errors no longer
@@ -86,7 +91,8 @@ class ImuWatch:
         motion = visual.motion if visual.quality is Quality.GOOD else None
         self._add_step(step_ns, motion)
         if self.is_left_out:
-            return None if motion is None or stamp_ns < self._next_ns else self._compare(stamp_ns)
+            is_due = is_applied and motion is not None and stamp_ns >= self._next_ns
+            return self._compare(stamp_ns) if is_due else None
         if motion is not None and gate_result is not None and step_ns < _MAX_STEP_NS:
             witnesses = min(sum(_bears_out(report) for report in visual.pairs.values()), _MAX_WITNESSES)
             self._refused.append((stamp_ns, 0 if gate_result.accepted else step_ns * max(witnesses, 1)))
@@ -100,6 +106,8 @@ class ImuWatch:
         """Leave the IMU out until the rotations since it was first refused can be compared."""
         self._since_ns = next(ns for ns, refused_ns in self._refused if refused_ns)
         self._refused.clear()
+        if stamp_ns - self._used_since_ns >= _TRUSTED_AGAIN * self._wait_ns:
+            self._wait_ns = _FIRST_WAIT_NS
         self.is_left_out, self._next_ns = True, stamp_ns + self._wait_ns
         self._wait_ns = min(4 * self._wait_ns, _MAX_WAIT_NS)
         self._report(
@@ -120,7 +128,7 @@ class ImuWatch:
             self._report(stamp_ns, EventKind.IMU_USED_AGAIN, "it moves as the cameras do")
         elif not self._clock.correct(stamp_ns, match.shift_s):
             return None
-        self.is_left_out = False
+        self.is_left_out, self._used_since_ns = False, stamp_ns
         return match
 
     def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:

@@ -361,7 +361,7 @@ class Odometry:
         if update.needs_keyframe:
             self._frontend.start_keyframe()
         self._frontend.drop(update.outliers)
-        if self._imu.watch(stamp_ns, predicted.interval, visual):
+        if self._imu.watch(stamp_ns, predicted.interval, visual, applied.motion):
             self._frontend.start_keyframe()
             self._calibration.restart_imu()
         self._synchroniser.forget_before(stamp_ns)

@@ -172,7 +172,8 @@ class SelfCalibration:
         self._adjusted_at = 0
 
     def restart_imu(self) -> None:
-        """Leave the window that is not full, and the IMU samples until now: those that come are of another clock."""
+        """Leave what the IMU samples until now are a part of: those that come are of another clock."""
+        self._drop_pending()
         self.start_window()
         self._collector.forget_samples()
 
@@ -244,11 +245,15 @@ class SelfCalibration:
         if self._refused >= _MAX_REFUSED:
             self._forget_places(range(len(self._rig.groups)))
 
+    def _drop_pending(self) -> None:
+        """Leave the window that is adjusted now, which is from before a break; it reads what changes then."""
+        if self._pending is not None:
+            wait([self._pending])
+            self._pending = None
+
     def _forget_places(self, groups: Iterable[int]) -> None:
         """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
-        if self._pending is not None:
-            wait([self._pending])  # it is of a window from before the knock, and reads what changes now
-            self._pending = None
+        self._drop_pending()
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0

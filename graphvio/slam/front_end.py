@@ -127,7 +127,8 @@ class FrontEnd:
             previous = None
         motion = None if previous is None else self._motion_since(previous, estimate, new)
         config = self._odometry.config
-        rig = self._odometry.refined_rig or self.rig
+        calibration = self._odometry.calibration
+        rig = self.rig if calibration is None else calibration.rig
         keyframe = Keyframe(
             id=self.log.next_id,
             epoch=estimate.epoch,
