@@ -9,13 +9,13 @@ from graphvio.arrays import Float
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.backend.states import RigState
 from graphvio.config import Config
-from graphvio.geometry import se3, se3_inverse, so3_exp
+from graphvio.geometry import se3, se3_adjoint, se3_inverse, so3_exp
 from graphvio.measurements.gate_result import GateResult
-from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.motion import PairReport, Quality, RelativeMotion, VisualResult
 from graphvio.odometry.innovation_allowance import InnovationAllowance
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.innovation import InnovationErrors
-from graphvio.self_calibration.parameters import PAIR
+from graphvio.self_calibration.parameters import PAIR, STEREO
 from graphvio.simulation.default_rig import default_rig
 
 STEP_NS, STEP = 50_000_000, se3(so3_exp(np.array([0.02, -0.03, 0.05])), np.array([0.04, 0.0, 0.01]))
@@ -91,3 +91,77 @@ def test_innovation_allowance_before_the_first_frameset_and_from_a_forgotten_sta
     assert allowed(allowance, estimator, 0) is None
     allowance.add(0, estimator, {0}, COVARIANCE)
     assert allowed(allowance, estimator, 7) is None
+
+
+# ------------------------------------------------------------------ errors within pairs
+
+BY_DEPTH = np.zeros((2, 2, 6))
+BY_DEPTH[0, 0] = [0.001, -0.002, 0.0, 0.04, 0.01, 0.02]  # of one step
+BY_DEPTH[1, 0] = [0.0, 0.002, 0.001, -0.03, 0.01, 0.01]
+
+
+class Walk:
+    """Steps, each of which is measured from the first frameset by one or both pairs."""
+
+    def __init__(self) -> None:
+        self.allowance, self.estimator = InnovationAllowance(default_rig()), MovingEstimator()
+        self.estimator.move(is_accepted=True)
+        self.allowance.add(0, self.estimator, {0}, COVARIANCE)
+
+    def step(self, pairs: frozenset[int], is_accepted: bool = True) -> Float:
+        """Return what is added to the motion."""
+        stamp_ns = self.estimator.move(is_accepted)
+        since = self.estimator.motion_since(0)
+        assert since is not None
+        steps = stamp_ns // STEP_NS
+        seen = np.array([[[j in pairs]] for j in range(2)])
+        now_T_each = [np.linalg.matrix_power(se3_inverse(STEP), k) for k in range(steps)]
+        derivatives = sum(seen * BY_DEPTH @ se3_adjoint(back).T for back in now_T_each)  # the error is in each step
+        motion = RelativeMotion(0, stamp_ns, se3_inverse(since), np.eye(6), np.zeros((6, 6)), 100, derivatives)
+        report = PairReport(100, 100, np.zeros((0, 2)), np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), {})
+        visual = VisualResult(motion, Quality.GOOD, "", dict.fromkeys(pairs, report))
+        found = self.allowance.allow(visual, self.estimator).motion
+        assert found is not None
+        assert found.calibration_covariance is not None
+        self.allowance.add(stamp_ns, self.estimator, {0}, COVARIANCE)
+        return found.calibration_covariance
+
+
+BOTH, FRONT, BACK = frozenset({0, 1}), frozenset({0}), frozenset({1})
+
+
+def test_innovation_allowance_for_wrong_depths_is_for_the_way_since_vision_was_followed() -> None:
+    walk, errors = Walk(), InnovationErrors(COVARIANCE, default_rig())
+    found = [walk.step(BOTH, is_accepted) for is_accepted in (True, True, True, False, False, True)]
+    of_step = np.trace(errors.of_depths(BY_DEPTH))
+    added = [np.trace(each) for each in found]
+    assert of_step > 0.5 * added[2]
+    np.testing.assert_allclose(added[1:3], added[0], rtol=0.1)
+    assert added[4] > 1.8 * added[2]  # nothing was followed for two steps
+
+
+def test_innovation_allowance_for_other_pairs_is_for_the_whole_way() -> None:
+    of_pairs = Walk()
+    walk = Walk()
+    for _ in range(8):
+        walk.step(FRONT)
+        of_pairs.step(FRONT)
+    alone = of_pairs.step(FRONT)
+    assert np.trace(walk.step(BACK)) > 10.0 * np.trace(alone)
+
+
+def test_innovation_allowance_after_recalibration_is_for_the_whole_way() -> None:
+    walk, change = Walk(), np.zeros(2 * PAIR)
+    for _ in range(8):
+        before = walk.step(BOTH)
+    assert not walk.allowance.recalibrate(change)
+    assert np.trace(walk.step(BOTH)) > 10.0 * np.trace(before)
+
+
+def test_recalibration_by_more_than_the_noise_of_motions_is_a_jump() -> None:
+    walk, change = Walk(), np.zeros(2 * PAIR)
+    walk.step(BOTH)
+    change[STEREO : STEREO + 3] = 1e-3
+    assert not walk.allowance.recalibrate(change)  # the covariance of the motion is large
+    change[STEREO : STEREO + 3] = 1e3
+    assert walk.allowance.recalibrate(change)

@@ -8,7 +8,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3, se3_exp, se3_inverse, se3_log, so3_exp, so3_log
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.innovation import InnovationErrors
-from graphvio.self_calibration.parameters import BODY, PAIR
+from graphvio.self_calibration.parameters import BODY, PAIR, RigCalibration
 from graphvio.simulation.default_rig import default_rig
 
 IMU = 2 * PAIR
@@ -30,12 +30,30 @@ def assert_sampled(errors: Float, covariance: Float) -> None:
 
 
 def test_innovation_errors_of_the_place_in_body_are_those_of_motions_by_wrong_cameras() -> None:
-    rng, sigmas = np.random.default_rng(1), np.repeat([0.01, 0.02], 3)
-    errors = InnovationErrors(covariance_with(BODY, np.diag(sigmas**2)), default_rig())
-    found = [
-        se3_log(se3_inverse(MOTION) @ se3_exp(d) @ MOTION @ se3_exp(-d)) for d in sigmas * rng.normal(size=(SAMPLES, 6))
-    ]
+    rng, sigmas, nominal = np.random.default_rng(1), np.repeat([0.01, 0.02], 3), default_rig()
+    errors = InnovationErrors(covariance_with(BODY, np.diag(sigmas**2)), nominal)
+    found = []
+    for place in sigmas * rng.normal(size=(SAMPLES, 6)):
+        difference = np.zeros(IMU)
+        difference[BODY:PAIR] = place
+        moved = RigCalibration.of(nominal).moved(difference).body_T_left[0]
+        error = moved @ nominal.pairs[0].left.cam_T_body
+        found.append(se3_log(se3_inverse(MOTION) @ error @ MOTION @ se3_inverse(error)))
     assert_sampled(np.array(found), errors.covariance(MOTION, None, None))
+
+
+def test_innovation_errors_of_another_pairs_place_are_those_of_motions_by_it() -> None:
+    rng, sigmas, nominal = np.random.default_rng(5), np.repeat([0.01, 0.02], 3), default_rig()
+    errors = InnovationErrors(covariance_with(PAIR + BODY, np.diag(sigmas**2)), nominal)
+    found = []
+    for place in sigmas * rng.normal(size=(SAMPLES, 6)):
+        difference = np.zeros(IMU)
+        difference[PAIR + BODY :] = place
+        moved = RigCalibration.of(nominal).moved(difference).body_T_left[1]
+        error = moved @ nominal.pairs[1].left.cam_T_body
+        found.append(se3_log(se3_inverse(MOTION) @ error @ MOTION @ se3_inverse(error)))
+    assert_sampled(np.array(found), errors.of_other_place(1, MOTION))
+    assert not errors.of_other_place(0, MOTION).any()
 
 
 def test_innovation_errors_of_the_gyros_matrix_are_those_of_rates_by_a_wrong_matrix() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -13,6 +14,7 @@ from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.alignment import Misalignment
+from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.frozen import Frozen, FrozenImages
 from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.motion_stereo import MotionHistory
@@ -265,7 +267,7 @@ class VisualFrontend:
         stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
         hypotheses = [
             graded_hypothesis(
-                self._relative_motion(seen, hypothesis.refined),
+                self._with_depth_errors(self._relative_motion(seen, hypothesis.refined), seen, hypothesis.refined),
                 seen.frozen.all_since_ns,
                 stereo,
                 (hypothesis.refined.rms_px() or 0.0) / self._config.motion.pixel_sigma_px,
@@ -365,6 +367,14 @@ class VisualFrontend:
             np.zeros((6, 6)) if used_once else refined.shared_covariance,
             int(refined.inlier.sum()),
         )
+
+    def _with_depth_errors(self, motion: RelativeMotion, seen: _Seen, refined: Refined) -> RelativeMotion:
+        """Add the derivatives by errors of the pairs' depths, by which an IMU may contradict the motion."""
+        if not self._config.estimates_calibration or self._rig.imu is None:
+            return motion
+        observations, cur_T_ref = seen.correspondences.observations, np.ascontiguousarray(refined.cur_T_ref)
+        derivatives = by_depth_errors(self._places.arrays, observations, refined.inlier, cur_T_ref)
+        return replace(motion, by_depth_errors=derivatives)
 
     def _own_motions(self, seen: _Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
         """Return each pair's own motion without the corrections in force; with one pair alone, that is the rig's."""

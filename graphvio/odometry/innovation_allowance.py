@@ -4,22 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Set
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
-from graphvio.geometry import se3_inverse
+from graphvio.geometry import se3_adjoint, se3_inverse
+from graphvio.linear_algebra import squared_length
 from graphvio.measurements.motion import RelativeMotion, VisualResult
 from graphvio.rig import Rig
 from graphvio.self_calibration.innovation import InnovationErrors
+from graphvio.self_calibration.parameters import depths_of_pair
+
+_MAX_JUMP2 = 25.0  # squared Mahalanobis distance by the covariance of a motion
+
+
+class _Measured(NamedTuple):
+    """A motion, and the pairs that it was measured by."""
+
+    motion: RelativeMotion
+    pairs: frozenset[int]
+
+    def is_before(self, motion: RelativeMotion) -> bool:
+        """Whether it is a part of another one."""
+        return self.motion.reference_stamp_ns == motion.reference_stamp_ns
 
 
 class InnovationAllowance:
     """Adds to motions by vision the covariance by which errors of the calibration make them contradict the IMU.
 
     The state follows vision, and velocity and biases follow what the errors do. An innovation therefore contains what
-    they add since vision last constrained the state, mostly over one step.
+    they add since vision last constrained the state, mostly over one step; but all that they add to a motion by other
+    pairs than those that the state has followed, or by another calibration, since the errors are others.
 
     Args:
         rig: To which the covariance of the calibration belongs.
@@ -30,6 +47,9 @@ class InnovationAllowance:
         self._errors: InnovationErrors | None = None
         self._covariance: Float | None = None
         self._followed_ns = -1  # the newest frameset whose motion passed the test
+        self._followed: _Measured | None = None  # that motion
+        self._tested: _Measured | None = None  # the newest one
+        self._tested_by: dict[frozenset[int], RelativeMotion] = {}  # the newest one of each set of pairs
         self._velocity: Float | None = None  # (6,) of body at the newest frameset
         self._velocities: dict[int, Float | None] = {}
         """The same one frameset before that and before those which motions are measured from."""
@@ -47,11 +67,34 @@ class InnovationAllowance:
             self._covariance, self._errors = covariance, InnovationErrors(covariance, self._rig)
         gate_result = estimator.gate_results.get("vision")
         if gate_result is not None and gate_result.accepted:
-            self._followed_ns = stamp_ns
+            self._followed_ns, self._followed = stamp_ns, self._tested
+        if self._tested is not None:
+            self._tested_by[self._tested.pairs] = self._tested.motion
+        self._tested_by = {
+            pairs: motion for pairs, motion in self._tested_by.items() if motion.reference_stamp_ns in references
+        }
         kept = {*references, self._followed_ns}
         self._velocities = {ns: each for ns, each in self._velocities.items() if ns in kept}
         self._velocities[stamp_ns] = self._velocity
         self._velocity = _body_velocity(estimator)
+
+    def recalibrate(self, change: Float) -> bool:
+        """Take note that motions are measured with another calibration from now on.
+
+        Args:
+            change: (C,) of the cameras' calibration.
+
+        Returns:
+            Whether motions since the references change by more than their noise: the state cannot follow such a jump.
+        """
+        self._followed = None
+        of_depths = np.array([depths_of_pair(self._rig, j) @ change for j in range(len(self._rig.pairs))])
+        return any(
+            squared_length(np.einsum("jk,jkt", of_depths, motion.by_depth_errors[: len(of_depths)]), motion.covariance)
+            > _MAX_JUMP2
+            for motion in self._tested_by.values()
+            if motion.by_depth_errors is not None
+        )
 
     def allow(self, visual: VisualResult, estimator: StateEstimator) -> VisualResult:
         """Return a frameset's result whose motions have the covariance that the calibration's errors add.
@@ -60,20 +103,31 @@ class InnovationAllowance:
             visual: Of the frameset.
             estimator: Has predicted the state there.
         """
-        errors, now = self._errors, self._velocity  # that of the state here would come from the IMU under test
-        if visual.motion is None or errors is None:
+        pairs = frozenset(j for j, report in visual.pairs.items() if report.inliers)
+        self._tested = None if visual.motion is None else _Measured(visual.motion, pairs)
+        if visual.motion is None or self._errors is None:
             return visual
+        alternatives = tuple(self._allowed(motion, pairs, estimator) for motion in visual.alternatives)
+        return replace(visual, motion=self._allowed(visual.motion, pairs, estimator), alternatives=alternatives)
 
-        def allowed(motion: RelativeMotion) -> RelativeMotion:
-            since_ns = max(motion.reference_stamp_ns, self._followed_ns)
-            now_T_then = estimator.motion_since(since_ns)
-            if now_T_then is None:
-                return motion
-            added = errors.covariance(se3_inverse(now_T_then), self._velocities.get(since_ns), now)
-            return replace(motion, calibration_covariance=added)
-
-        alternatives = tuple(map(allowed, visual.alternatives))
-        return replace(visual, motion=allowed(visual.motion), alternatives=alternatives)
+    def _allowed(self, motion: RelativeMotion, pairs: frozenset[int], estimator: StateEstimator) -> RelativeMotion:
+        assert self._errors is not None
+        since_ns = max(motion.reference_stamp_ns, self._followed_ns)
+        now_T_since = estimator.motion_since(since_ns)
+        if now_T_since is None:
+            return motion
+        now = self._velocity  # that of the state here would come from the IMU under test
+        added = self._errors.covariance(se3_inverse(now_T_since), self._velocities.get(since_ns), now)
+        followed = self._followed
+        if motion.by_depth_errors is not None:
+            by_depth_errors = motion.by_depth_errors
+            if followed is not None and followed.motion.by_depth_errors is not None and followed.is_before(motion):
+                by_depth_errors = by_depth_errors - followed.motion.by_depth_errors @ se3_adjoint(now_T_since).T
+            added = added + self._errors.of_depths(by_depth_errors)
+        if followed is not None and followed.pairs != pairs:
+            for j in followed.pairs ^ pairs:
+                added = added + self._errors.of_other_place(j, motion.reference_T_current)
+        return replace(motion, calibration_covariance=added)
 
 
 def _body_velocity(estimator: StateEstimator) -> Float | None:

@@ -24,6 +24,7 @@ from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction
 from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
+from graphvio.self_calibration.parameters import n_of_cameras
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
 _MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
@@ -67,6 +68,7 @@ class PairsCalibration:
         self._calibration = SelfCalibration(rig)
         self._allowance = None if rig.imu is None else InnovationAllowance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
+        self._in_force = np.zeros(n_of_cameras(rig))  # difference of the cameras' calibration from the rig file
         self._margin_px = self._epipolar_margin_px()
         frontend.recalibrate(rig, self._margin_px)
 
@@ -126,6 +128,10 @@ class PairsCalibration:
         self._margin_px = margin_px
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(self.estimate.rig, margin_px, self._calibration.extrinsics)
+        cameras = self.estimate.difference[: n_of_cameras(self._rig)]
+        change, self._in_force = cameras - self._in_force, cameras
+        if self._allowance is not None and self._allowance.recalibrate(change):
+            self._frontend.start_keyframe()
         self._correct_imu()
         return self._turn()
 

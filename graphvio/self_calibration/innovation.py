@@ -8,16 +8,19 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import n_of_cameras, place_of
+from graphvio.self_calibration.parameters import about_origin, depths_of_pair, n_of_cameras, place_of
+from graphvio.self_calibration.prior import extrinsic_covariances
+
+_ERROR_SHARE = 0.2  # of what wrong depths do, in all directions: errors away from the middle of the image do otherwise
 
 
 class InnovationErrors:
-    """Errors of the cameras' place in body, of the gyro's matrix and of the time offset, in a motion's innovation.
+    """Errors of cameras and their place in body, of the gyro's matrix and of the time offset, in a motion's innovation.
 
     The innovation is the motion of body by vision less that by the IMU. To a motion M of body, an error d of the
     cameras' place adds ``(Ad(M^-1) - I) d``, an error D of the gyro's matrix the rotation ``D phi`` with M's rotation
     vector phi, and an error of the time offset the motion that body makes in it at the end, less that at the beginning.
-    The three are taken as independent.
+    Errors within a pair add what wrong depths do, see `graphvio.frontend.depth_errors`. All are taken as independent.
 
     Args:
         covariance: (C, C) of the calibration of the cameras and the IMU.
@@ -25,8 +28,12 @@ class InnovationErrors:
     """
 
     def __init__(self, covariance: Float, rig: Rig) -> None:
-        imu = covariance[n_of_cameras(rig) :, n_of_cameras(rig) :]
-        self._of_place = covariance[place_of(rig, 0), place_of(rig, 0)]
+        n, to_origin = n_of_cameras(rig), about_origin(rig, 0)
+        imu = covariance[n:, n:]
+        self._of_place = to_origin @ covariance[place_of(rig, 0), place_of(rig, 0)] @ to_origin.T
+        self._of_other_places = extrinsic_covariances(rig, covariance)
+        by_depths = [depths_of_pair(rig, j) for j in range(len(rig.pairs))]
+        self._of_depths = [rows @ covariance[:n, :n] @ rows.T for rows in by_depths]
         self._of_matrix = imu[GYRO_MATRIX:ACCEL_MATRIX, GYRO_MATRIX:ACCEL_MATRIX].reshape(3, 3, 3, 3)
         self._of_time_offset = float(imu[TIME_OFFSET, TIME_OFFSET])
 
@@ -51,3 +58,26 @@ class InnovationErrors:
             by_time = now - carried @ before
             covariance += self._of_time_offset * np.outer(by_time, by_time)
         return np.asarray(covariance)
+
+    def of_depths(self, derivatives: Float) -> Float:
+        """Return the covariance that errors within the pairs add.
+
+        Args:
+            derivatives: (P, 2, 6) of the innovation, see `graphvio.measurements.motion.RelativeMotion`.
+
+        Returns:
+            (6, 6), tangent as that of the derivatives.
+        """
+        added = np.zeros((6, 6))
+        for each, of_pair in zip(derivatives, self._of_depths, strict=False):
+            added += each.T @ of_pair @ each
+        for block in (slice(3), slice(3, 6)):
+            added[block, block] += _ERROR_SHARE**2 * np.trace(added[block, block]) / 3.0 * np.eye(3)
+        return added
+
+    def of_other_place(self, j: int, motion: Float) -> Float:
+        """Return the covariance (6, 6) that the error of a pair's place relative to the first pair adds to a motion."""
+        if j not in self._of_other_places:
+            return np.zeros((6, 6))
+        by_place = se3_adjoint(se3_inverse(motion)) - np.eye(6)
+        return np.asarray(by_place @ self._of_other_places[j] @ by_place.T)

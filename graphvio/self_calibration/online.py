@@ -309,7 +309,7 @@ class SelfCalibration:
         _ = estimate.rig  # raises where there is no such rig
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
-            extrinsics = extrinsic_covariances(self._rig, anywhere)
+            extrinsics = extrinsic_covariances(self._rig, anywhere.covariance)
         by_cameras = solution.poses_by_cameras(n_cameras)
         return _Adjusted(
             prior,

@@ -80,6 +80,34 @@ def is_linear(camera: Camera) -> Bool:
     return np.array([i < len(names) and names[i] in linear for i in range(DISTORTION)])
 
 
+def about_origin(rig: Rig, j: int) -> Float:
+    """Return the derivatives (6, 6) of d by the parameters of a place in body, where it is ``exp(d) body_T_left``."""
+    rows = np.eye(6)
+    rows[3:, :3] = skew(rig.groups[j].left.body_T_cam[:3, 3])
+    return rows
+
+
+def depths_of_pair(rig: Rig, j: int) -> Float:
+    """Return the derivatives (2, `n_of_cameras`) of what a pair's calibration adds to inverse depths in its left view.
+
+    The first row is the offset of all of them, 1/m, in the middle of the image; the second one is a share of each.
+    """
+    rows, pair = np.zeros((2, n_of_cameras(rig))), rig.pairs[j]
+    own = rows[:, slices_of_groups(rig)[j]]
+    right_T_left = pair.right.cam_T_body @ pair.left.body_T_cam
+    right_R_left, baseline = right_T_left[:3, :3], right_T_left[:3, 3]
+    far = right_R_left[:, 2]  # what is far in the middle of the left image, seen by the right camera
+    projection = (np.eye(3)[:2] - np.outer(far[:2] / far[2], np.eye(3)[2])) / far[2]
+    by_inverse_depth = projection @ baseline
+    towards = by_inverse_depth / (by_inverse_depth @ by_inverse_depth)
+    own[0, CAMERA : CAMERA + 2] = -towards * far[:2] / far[2] / pair.right.focal_px
+    own[0, CAMERA + 2 : CAMERA + INTRINSICS] = -towards / pair.right.focal_px
+    own[0, 2:INTRINSICS] = towards @ projection @ right_R_left[:, :2] / pair.left.focal_px
+    own[0, STEREO : STEREO + ROTATION] = towards @ projection @ right_R_left @ skew(np.eye(3)[2])
+    own[1, STEREO + ROTATION : BODY] = -towards @ projection
+    return rows
+
+
 def relative_to_first(rig: Rig, j: int) -> Float:
     """Return the derivatives (6, `n_of_cameras`) of a group's rotation and translation in body, seen from group 0.
 

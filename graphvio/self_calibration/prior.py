@@ -23,6 +23,7 @@ from graphvio.self_calibration.parameters import (
     DISTORTION,
     INTRINSICS,
     STEREO,
+    about_origin,
     is_linear,
     n_of_cameras,
     place_of,
@@ -77,18 +78,20 @@ def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
     return walk
 
 
-def extrinsic_covariances(rig: Rig, posterior: Gaussian) -> dict[int, Float]:
+def extrinsic_covariances(rig: Rig, covariance: Float) -> dict[int, Float]:
     """Return the covariances of the places of pairs and single cameras relative to the first pair.
+
+    Args:
+        rig: G pairs and single cameras.
+        covariance: (C, C) of the calibration.
 
     Returns:
         Index, of all but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``.
     """
     n = n_of_cameras(rig)
-    of_cameras, found = posterior.covariance[:n, :n], {}
-    for j, group in enumerate(rig.groups[1:], start=1):
-        about_origin = np.eye(6)  # of body, and not about the camera
-        about_origin[3:, :3] = skew(group.left.body_T_cam[:3, 3])
-        rows = about_origin @ relative_to_first(rig, j)
+    of_cameras, found = covariance[:n, :n], {}
+    for j in range(1, len(rig.groups)):
+        rows = about_origin(rig, j) @ relative_to_first(rig, j)
         found[j] = rows @ of_cameras @ rows.T
     return found
 
