@@ -19,6 +19,7 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 _MIN_STEPS = 20
 _MIN_COVERED_S = 2.0
 _SHIFT_STEP_S = 0.005
+_COARSE = 4  # such steps, by which all shifts are compared first
 _LOBE_S = 0.1  # shifts that are closer are of the same minimum
 _DISTINCT = 2.0  # times the least difference that all other shifts must have
 _MIN_CHANGE_RAD_S = 0.1  # of the rates, RMS about their mean: with less, one shift fits as well as another
@@ -91,20 +92,23 @@ def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s
     """
     if not steps:
         return None
-    count = round(max_shift_s / _SHIFT_STEP_S)
-    shifts = _SHIFT_STEP_S * np.arange(-count, count + 1, dtype=np.float64)
-    compared = _compared(steps, readings, shifts)
+    count = round(max_shift_s / (_COARSE * _SHIFT_STEP_S))
+    coarse = _COARSE * np.arange(-count, count + 1, dtype=np.float64)
+    over_all = _compared(steps, readings, _SHIFT_STEP_S * coarse).differences
+    near = coarse[np.argmin(over_all)] + np.arange(-_COARSE, _COARSE + 1, dtype=np.float64)
+    compared = _compared(steps, readings, _SHIFT_STEP_S * near)
     differences = compared.differences
     best = int(np.argmin(differences))
     least = float(differences[best])
-    if not 0 < best < 2 * count or not np.isfinite(differences[best - 1 : best + 2]).all():  # at the edge of a range
+    # A minimum at the end of the shifts, or of the samples, may be none.
+    if not 0 < best < 2 * _COARSE or not np.isfinite(differences[best - 1 : best + 2]).all():
         return None
     if not compared.is_alike(best):
         return None
-    others: Bool = np.abs(shifts - shifts[best]) > _LOBE_S
-    if (differences[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
+    others: Bool = np.abs(coarse - near[best]) * _SHIFT_STEP_S > _LOBE_S
+    if (over_all[others] < _DISTINCT * max(least, _RATE_NOISE_RAD_S)).any():
         return None
-    shift_s = float(shifts[best]) + _beyond(differences[best - 1 : best + 2])
+    shift_s = _SHIFT_STEP_S * float(near[best]) + _beyond(differences[best - 1 : best + 2])
     gyro_bias = compared.errors[best][compared.is_known[best]].mean(axis=0)
     return RateMatch(shift_s, gyro_bias, least / compared.tolerance(best))
 
