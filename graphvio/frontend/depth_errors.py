@@ -1,8 +1,8 @@
 """How a motion depends on depths by stereo that are wrong, as an error of a pair's calibration makes them.
 
 Principal points and the rotation from left to right add an offset to all inverse depths of a pair, at the reference and
-now alike; the baseline adds a share. Near points do not tell the two from a translation, nor far points an offset from
-a rotation: what becomes of the motion depends on where its points are.
+now alike; the baseline adds a share. By near points alone the two look like a translation, by far points alone an
+offset looks like a rotation: what becomes of the motion depends on where its points are.
 """
 
 from __future__ import annotations
