@@ -116,8 +116,8 @@ class Walk:
         steps = stamp_ns // STEP_NS
         seen = np.array([[[j in pairs]] for j in range(2)])
         now_T_each = [np.linalg.matrix_power(se3_inverse(STEP), k) for k in range(steps)]
-        derivatives = sum(seen * BY_DEPTH @ se3_adjoint(back).T for back in now_T_each)  # the error is in each step
-        motion = RelativeMotion(0, stamp_ns, se3_inverse(since), np.eye(6), np.zeros((6, 6)), 100, derivatives)
+        of_steps = np.array([seen * BY_DEPTH @ se3_adjoint(back).T for back in now_T_each])  # the error is in each step
+        motion = RelativeMotion(0, stamp_ns, se3_inverse(since), np.eye(6), np.zeros((6, 6)), 100, of_steps.sum(axis=0))
         report = PairReport(100, 100, np.zeros((0, 2)), np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), {})
         visual = VisualResult(motion, Quality.GOOD, "", dict.fromkeys(pairs, report))
         found = self.allowance.allow(visual, self.estimator).motion
