@@ -18,6 +18,7 @@ from graphvio.evaluation import evaluate
 from graphvio.frontend.images import ImageMask, UsablePixels, checked
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.sensors import Measurement
+from graphvio.rig import Camera
 from graphvio.sessions.euroc_writer import EurocWriter
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
@@ -200,3 +201,13 @@ def test_masks_that_are_no_mapping_are_refused() -> None:
     measurement: Measurement = FrameSet(0, {}, masks)
     with pytest.raises(MeasurementError, match="masks is a list"):
         Odometry(small_rig(1)).process(measurement)
+
+
+def test_pixels_of_a_fisheye_that_have_no_ray_hold_no_points() -> None:
+    fisheye = Camera("cam0", "equidistant", (320, 320), np.array([96.0, 96.0, 160.0, 160.0]), np.zeros(4), np.eye(4))
+    x, y = np.meshgrid(np.arange(320), np.arange(320))
+    angle_deg = np.rad2deg(np.hypot(x - 160.0, y - 160.0) / 96.0)  # up to 135 degrees
+    usable = UsablePixels(fisheye, 11).always
+    assert not usable[angle_deg > 77.0].any()  # a patch reaches 6 pixels beyond its centre, 3.6 degrees
+    assert usable[angle_deg < 74.0].all()
+    assert UsablePixels(small_rig(1).pairs[0].left, 11).always.all()

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from graphvio.arrays import AnyArray, Float, Image
 from graphvio.geometry import se3, se3_inverse
+from graphvio.rig import Camera
 from graphvio.simulation import Simulator, make_simulator
 from graphvio.simulation.default_rig import default_rig, paper_left2_T_left1
 from graphvio.simulation.renderer import CameraRays
@@ -152,3 +153,13 @@ def test_frameset_holds_all_pairs(room: Simulator) -> None:
     assert frameset.stamp_ns == room.stamps_ns[7]
     assert sorted(frameset.images) == [0, 1]
     assert all(image.shape == (480, 640) for pair in frameset.images.values() for image in pair)
+
+
+def test_pixels_without_a_ray_are_black(room: Simulator) -> None:
+    fisheye = Camera("cam0", "equidistant", (160, 160), np.array([48.0, 48.0, 80.0, 80.0]), np.zeros(4), np.eye(4))
+    x, y = np.meshgrid(np.arange(160), np.arange(160))
+    is_beyond = np.hypot(x - 80.0, y - 80.0) / 48.0 > np.deg2rad(80.0)
+    view = CameraRays(fisheye).render(room.surfaces(0), room._stage.atlas, room.world_T_body[0])
+    assert (view.radiance[is_beyond] == 0.0).all()
+    assert np.isinf(view.depth[is_beyond]).all()
+    assert (view.radiance[~is_beyond] > 0.0).mean() > 0.95

@@ -59,13 +59,26 @@ def _checked_mask(mask: AnyArray | None, camera: Camera) -> Image | None:
     return np.asarray(mask != 0, dtype=np.uint8)
 
 
+def pixels_with_ray(camera: Camera) -> Bool:
+    """Return which pixels (height, width) have a ray: not those beyond the domain of a lens.
+
+    Of most lenses all have one, which those at the image's edge show.
+    """
+    width, height = camera.size_px
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    at_edge = (x == 0) | (y == 0) | (x == width - 1) | (y == height - 1)
+    if camera.unproject(np.column_stack([x[at_edge], y[at_edge]]))[1].all():
+        return np.ones((height, width), dtype=bool)
+    return camera.unproject(np.column_stack([x.ravel(), y.ravel()]))[1].reshape(height, width)
+
+
 ImageMask = Callable[[str, Image], AnyArray | None]
 """Takes a camera's name and its image (height, width), and returns a mask (height, width), whose zeros (or False) are
 not used, or None to use all of the image. It is called from several threads."""
 
 
 class UsablePixels:
-    """Where points of a camera's images may be: where no pixel of their patch is masked.
+    """Where points of a camera's images may be: where all pixels of their patch have a ray, and none is masked.
 
     Args:
         camera: with a mask that is the same for all images, or without.
@@ -73,7 +86,7 @@ class UsablePixels:
         image_mask: masks of each image, or None.
 
     Attributes:
-        always: (height, width) where points may be by the camera's own mask.
+        always: (height, width) where points may be by the camera's lens and its own mask.
 
     Raises:
         RigError: if the camera's mask is no image of its size.
@@ -94,6 +107,9 @@ class UsablePixels:
                     "camera's size, or remove the mask from the rig"
                 )
             self.always = self._shrunk(mask)
+        has_ray = pixels_with_ray(camera)
+        if not has_ray.all():
+            self.always &= self._shrunk(has_ray.astype(np.uint8))
 
     def of(self, image: Image, mask: Image | None = None) -> Bool:
         """Return where (height, width) points of an image may be.

@@ -40,20 +40,18 @@ class View:
 class CameraRays:
     """Rays of a camera's pixels, computed once and exact for its distortion.
 
+    Pixels without a ray, such as those of a fisheye that are more than 80 degrees from its axis, stay black.
+
     Args:
         camera: of the rig.
-
-    Raises:
-        ValueError: if a pixel has no ray.
     """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         width, height = camera.size_px
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-        rays, valid = camera.unproject(pixels.astype(np.float64))
-        if not valid.all():
-            raise ValueError(f"camera {camera.name}: {np.count_nonzero(~valid)} pixels have no ray")
+        rays, has_ray = camera.unproject(pixels.astype(np.float64))
+        self._has_ray = has_ray.reshape(height, width)
         self.rays = rays.reshape(height, width, 2)
         slopes = _ray_slopes(camera.model_number, camera.intrinsics, camera.distortion, rays)
         self.slopes = slopes.reshape(height, width, 2, 2)
@@ -76,6 +74,7 @@ class CameraRays:
             surfaces.texture, surfaces.mapping, surfaces.tint, atlas.texels, atlas.offsets, atlas.sides,
             surfaces.light.values, surfaces.light.grid,
         )  # fmt: skip
+        radiance[~self._has_ray], hit[~self._has_ray], inverse_depth[~self._has_ray] = 0.0, -1, 0.0
         with np.errstate(divide="ignore"):
             depth = 1.0 / inverse_depth
         return View(radiance, depth, surfaces.is_moving[hit] & (hit >= 0))
