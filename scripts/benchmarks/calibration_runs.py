@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,6 +43,7 @@ class CalibrationOutcome:
             second epoch begins.
         before: parameter with unit -> rms of its errors in the files, against the true rig at the end.
         after: the same of what the odometry estimated; nothing of what it does not estimate.
+        events: kind -> how many there were; not in the file of results.
     """
 
     ate_m: float
@@ -51,6 +53,7 @@ class CalibrationOutcome:
     pose_nees: float
     before: dict[str, float] = field(default_factory=dict)
     after: dict[str, float] = field(default_factory=dict)
+    events: dict[str, int] = field(default_factory=dict)
 
 
 class WronglyCalibrated:
@@ -124,6 +127,7 @@ class WronglyCalibrated:
             pose_nees=pose_nees,
             before=_rms(written, true),
             after=after,
+            events=Counter(event.kind for event in odometry.take_events()),
         )
 
     def _measurements(self, rig: Rig) -> Iterator[Measurement]:

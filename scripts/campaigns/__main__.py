@@ -12,13 +12,17 @@ from campaigns import (
     live,
     mapping,
     outages,
+    random_rigs,
     rates,
     real_imu,
     self_calibration,
     soak,
 )  # fmt: skip
 
-_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration, self_calibration, live, soak, mapping)
+_MODULES = (
+    consistency, real_imu, outages, endurance, rates, lags, calibration, self_calibration, random_rigs, live, soak,
+    mapping,
+)  # fmt: skip
 
 if __name__ == "__main__":
     sys.exit(
