@@ -12,6 +12,7 @@ from graphvio.rig import Rig
 
 MAX_SHIFT_S = 1.5
 """Largest error of the clock that is looked for."""
+_MIN_REPORTED_S = 1e-3  # several corrections may add up to nearly none
 
 
 def with_late_clock(rig: Rig, seconds: float) -> Rig:
@@ -46,7 +47,7 @@ class ImuClock:
     @property
     def warnings(self) -> list[str]:
         """What is to be corrected in the rig, a sentence or none."""
-        if not self.shift_s:
+        if abs(self.shift_s) < _MIN_REPORTED_S:
             return []
         return [f"IMU: {self._relation}; {self._what_is_done}"]
 
