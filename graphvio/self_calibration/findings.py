@@ -102,7 +102,12 @@ def described(found: list[Finding]) -> list[str]:
     if not found:
         return []
     wrong = [finding.part for finding in found if finding.is_significant]
-    sentences = [f"calibration corrected: {'; '.join(wrong)}"] if wrong else ["calibration: as in the rig file"]
+    if wrong:
+        sentences = [f"calibration corrected: {'; '.join(wrong)}"]
+    elif any(np.any(finding.difference) for finding in found):
+        sentences = ["calibration refined: the rig file is wrong, though no single part of it beyond 5 sigma"]
+    else:
+        sentences = ["calibration: as in the rig file"]
     n_hidden = sum(not finding.is_observed for finding in found)
     if n_hidden > _MAX_HIDDEN_SHARE * len(found):
         shown = f"{len(found) - n_hidden} of {len(found)} parts of the calibration"
