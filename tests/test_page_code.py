@@ -177,9 +177,11 @@ def test_single_cameras(room_walk: Path, tmp_path: Path) -> None:
 
 
 def for_a_second(arguments: list[str]) -> list[str]:
-    """Let a live command end, and take any port."""
+    """Let a live command end, with no more of a scene than that, and take any port."""
     if arguments[0] not in ("live", "slam", "serve"):
         return arguments
+    if arguments[1].startswith("simulator"):
+        arguments = [arguments[0], f"{arguments[1]}{'&' if '?' in arguments[1] else '?'}duration_s=2", *arguments[2:]]
     return [*arguments, "--for", "1"] + (["--health-port", "0"] if "--health-port" in arguments else [])
 
 

@@ -30,7 +30,7 @@ from graphvio.live.spec_options import choice_of, number_of, whole_number_of
 from graphvio.measurements.readings import DeviceHealth, Reading
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig
-from graphvio.simulation import SCENE_NAMES
+from graphvio.simulation import SCENE_NAMES, build_scene
 from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.sources import Source
 from graphvio.sources import open_source as open_recording
@@ -87,8 +87,8 @@ class SimulatedRig:
         legs: number of walks, there and back counting as two; None for no end.
         seed: of all noise.
         rate_hz: framesets per second.
-        recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders it once, into
-            graphvio's folder of the user's cache.
+        recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders it once, as much as
+            the duration takes, into graphvio's folder of the user's cache.
         rig_name: of the rig that is rendered.
         faults: options of `DeviceFaults.parse`.
     """
@@ -183,20 +183,32 @@ class SimulatedRig:
     def _ends_early(self, recording: Source) -> bool:
         return self._duration_s is not None and self._duration_s * 1e9 <= recording.end_ns - recording.start_ns
 
+    def _part_s(self) -> int | None:
+        """Return how many seconds of the walk are enough for the duration; None if it takes all of it."""
+        if self._duration_s is None:
+            return None
+        part_s = int(np.ceil(self._duration_s)) + 1
+        return part_s if part_s < build_scene(self._scene).motion.duration_s else None
+
     def _rendered(self) -> Path:
-        """Return the folder of the rendered scene, after rendering it if need be."""
-        root = cache_root().parent / "simulator"
+        """Return the folder of the rendered scene, after rendering it if need be, or as much of it as is asked for."""
+        root, part_s = cache_root().parent / "simulator", self._part_s()
         rig = "" if self._rig_name == "paper" else f"-{self._rig_name}"
-        folder = root / f"{self._scene}{rig}-seed{self._seed}-{self._rate_hz:g}hz-{_digest()}"
+        part = "" if part_s is None else f"-{part_s}s"
+        folder = root / f"{self._scene}{rig}-seed{self._seed}-{self._rate_hz:g}hz{part}-{_digest()}"
         if folder.is_dir():
             return folder
         unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
         arguments = ["simulate", self._scene, "--out", unfinished, "--seed", self._seed, "--rate", f"{self._rate_hz:g}"]
-        arguments += ["--rig", self._rig_name]
+        arguments += ["--rig", self._rig_name, *([] if part_s is None else ["--duration", part_s])]
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
         root.mkdir(parents=True, exist_ok=True)
         try:
-            _log.warning("rendering the simulated scene %s, once; it takes about three times its length", self._scene)
+            _log.warning(
+                "rendering %s of the simulated scene %s, once; it takes about three times its length",
+                "all" if part_s is None else f"{part_s} s",
+                self._scene,
+            )
             if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
                 raise SourceError(
                     f"simulator: {self._scene} could not be rendered; try  graphvio simulate {self._scene}"
