@@ -130,6 +130,26 @@ def test_inverse_depths_around_follow_the_slopes_of_stereo_matches(lens: tuple[s
     assert np.ptp(on_wall(rays) / on_wall(rays[0]), axis=0).min() > 0.01  # the wall is slanted, all over
 
 
+def test_inverse_depths_around_are_those_of_a_plane_far_from_a_fisheyes_axis() -> None:
+    """A plane's inverse depth is not linear in the pixels of such a lens: without that, all points seem to move too
+    far."""
+    lens = (512, 512), np.array([190.0, 190.0, 255.5, 255.5]), np.array([0.0034, 0.0007, -0.0020, 0.0002])
+    left, right = (Camera(each.name, "equidistant", *lens, each.body_T_cam) for each in (PAIR.left, PAIR.right))
+    pair = replace(PAIR, left=left, right=right)
+    angles = np.random.default_rng(3).uniform([0.8, -0.3], [1.15, 0.3], (50, 2))  # from the axis, to the right
+    turn = angles[:, 1]
+    at = around(255.5 + 190.0 * angles[:, :1] * np.column_stack([np.cos(turn), np.sin(turn)]), STEP_PX)
+    rays = unprojected(at, left)
+    found, true = (
+        inverse_depths_around(rays, on_wall(rays[0]), slopes(pair, at[0]), STEP_PX, *right_view(pair)),
+        on_wall(rays),
+    )
+    bend, true_bend = (0.5 * each[1:].sum(axis=0) - 2.0 * each[0] for each in (found, true))
+    assert np.abs(true_bend).min() > 0.0
+    np.testing.assert_allclose(bend, true_bend, rtol=0.1)
+    np.testing.assert_allclose(found, true, rtol=5e-3)
+
+
 def test_inverse_depths_around_unseen_points_are_their_own() -> None:
     at = around(pixels(3), STEP_PX)
     rays, steep = unprojected(at), np.full((3, 2), 0.3)

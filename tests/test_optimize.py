@@ -272,7 +272,7 @@ def test_optimize_wrong_file_is_calibrated_first(walk: Path, tmp_path: Path) -> 
         out = tmp_path / Path(config).stem
         done = command(walk, "--rig", tmp_path / "wrong.yaml", "--no-loops", "--config", config, "--out", out)
         assert done.exit_code == 0, done.output
-        assert ("walk: calibration refined: " in done.stdout) == (config == "default")
+        assert ("walk: calibration corrected: " in done.stdout) == (config == "default")
         (session,) = json.loads((out / "summary.json").read_text())["sessions"]
         errors[out.name] = session["ate_rmse"]["optimized"]["position_m"]
     assert errors["default"] < 0.3 * errors["as_it_is"]

@@ -202,7 +202,8 @@ def _locate(
             gain_y = -variance * (k0 * by_ray[0, 1] + k1 * by_ray[1, 1])
             e2 = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / det
             w += variance * (k0 * r0 + k1 * r1 + (PRIOR_INVERSE_DEPTH - w) / prior)
-        if not e2 < max_distance or w < -3.0 * np.sqrt(variance):
+        # Where the motion is hardly known, rounding may make S indefinite, and variances negative.
+        if not (0.0 <= e2 < max_distance and w >= -3.0 * np.sqrt(variance)):
             fits[i], w, variance, gain_x, gain_y = False, PRIOR_INVERSE_DEPTH, prior, 0.0, 0.0
         points[i, 0], points[i, 1], points[i, 2] = x, y, w
         covariances[i, 0, 0] = covariances[i, 1, 1] = pixel

@@ -120,6 +120,7 @@ def inverse_depths_around(
     depths = np.empty((5, n))
     limit = fold_radius(model, distortion)
     u, v = np.empty(5), np.empty(5)
+    changes, steps = np.empty(2), np.empty((2, 2))  # of inverse depth and ray, from left to right and downwards
     for i in range(n):
         w = inverse_depths[i]
         depths[:, i] = w
@@ -138,9 +139,16 @@ def inverse_depths_around(
             left, right = 2 * k + 1, 2 * k + 2
             flat = ((u[right] - u[left]) * along_u + (v[right] - v[left]) * along_v) / (2.0 * step_px)
             seen = slopes[i, k] + (along_u if k == 0 else along_v)
-            change = step_px * (seen - flat) / length
-            depths[left, i] -= change
-            depths[right, i] += change
+            changes[k] = 2.0 * step_px * (seen - flat) / length
+            steps[k, 0], steps[k, 1] = rays[right, i, 0] - rays[left, i, 0], rays[right, i, 1] - rays[left, i, 1]
+        # A plane's inverse depth is linear in normalised coordinates, which are not linear in pixels.
+        determinant = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
+        if not determinant > 0.0:  # next to the edge of what the lens can see
+            continue
+        by_x = (changes[0] * steps[1, 1] - changes[1] * steps[0, 1]) / determinant
+        by_y = (changes[1] * steps[0, 0] - changes[0] * steps[1, 0]) / determinant
+        for k in range(1, 5):
+            depths[k, i] += by_x * (rays[k, i, 0] - rays[0, i, 0]) + by_y * (rays[k, i, 1] - rays[0, i, 1])
     return depths
 
 

@@ -1,4 +1,4 @@
-"""``scripts/benchmark lenses``: accuracy by the lens model at the same field of view, and with rolling shutters."""
+"""``scripts/benchmark lenses``: accuracy by the lens model at the same field of view, rolling shutters, fisheyes."""
 
 from __future__ import annotations
 
@@ -35,17 +35,20 @@ _LENSES: Mapping[str, tuple[str, Sequence[float]]] = {
     "extended-unified": ("extended-unified", [0.6, 1.1]),
     "omnidirectional": ("omnidirectional", [0.7, -0.1, 0.05, 3e-4, -2e-4]),
 }
+_FISHEYE = np.array([0.0034, 0.0007, -0.0020, 0.0002])
+_FISHEYES = {"512x512, 154 degrees": ((512, 512), 190.0), "848x800, 170 degrees": ((848, 800), 286.0)}
+"""Name with the angle across -> size, and pixels for a radian: as TUM-VI's cameras, and as a T265's."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "lenses",
-        help="accuracy by the lens model, and with rolling shutters",
+        help="accuracy by the lens model, with rolling shutters, and with wide fisheyes",
         description=f"Runs a stereo pair with IMU through the room, with images that are {_SIZE_PX[0]} pixels wide: "
         f"with each lens model at {_FIELD_OF_VIEW_DEG:g} degrees, and as high as a pinhole's view of {_SIZE_PX[1]} "
-        f"pixels; and with pinhole cameras whose lines are read out in {_READOUT_MS:g} ms, with and without the line "
-        "time in the rig.",
+        f"pixels; with pinhole cameras whose lines are read out in {_READOUT_MS:g} ms, with and without the line time "
+        "in the rig; and with wide fisheyes of larger images, which see 160 degrees at most.",
         epilog="Example: scripts/benchmark lenses --seeds 1 --duration 10",
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
@@ -74,6 +77,13 @@ def run_all(args: argparse.Namespace) -> None:
         f"rolling, {_READOUT_MS:g} ms, not in the rig": _ates_mm(args, "rolling", rolling, has_line_time=False),
     }
     report.table(("shutter", "ATE, mm, median", "worst", "over global"), _rows(shutters, "global"))
+    fisheyes = {
+        (name, scene): _ates_mm(args, name.replace(", ", "-"), fisheye_rig(*lens), scene)
+        for name, lens in _FISHEYES.items()
+        for scene in ("room", "corridor")
+    }
+    rows = [(*key, f"{median(each):.2f}", f"{max(each):.2f}") for key, each in fisheyes.items()]
+    report.table(("fisheyes", "scene", "ATE, mm, median", "worst"), rows)
     report.write(args, "lenses")
 
 
@@ -98,6 +108,17 @@ def rig_of(lens: str) -> Rig:
     return stereo().with_cameras(change)
 
 
+def fisheye_rig(size_px: tuple[int, int], focal_px: float) -> Rig:
+    """Return the simulator's stereo pair with equidistant fisheyes."""
+    (width, height), model = size_px, "equidistant"
+    intrinsics = np.array([focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)])
+
+    def change(camera: Camera) -> Camera:
+        return replace(camera, model=model, distortion=_FISHEYE, intrinsics=intrinsics, size_px=size_px)
+
+    return stereo().with_cameras(change)
+
+
 def _rows(ates_mm: Mapping[str, Sequence[float]], base: str) -> list[tuple[str, ...]]:
     return [
         (name, f"{median(each):.2f}", f"{max(each):.2f}", f"{median(each) / median(ates_mm[base]):.2f}")
@@ -105,14 +126,16 @@ def _rows(ates_mm: Mapping[str, Sequence[float]], base: str) -> list[tuple[str, 
     ]
 
 
-def _ates_mm(args: argparse.Namespace, name: str, rig: Rig, has_line_time: bool = True) -> list[float]:
+def _ates_mm(
+    args: argparse.Namespace, name: str, rig: Rig, scene: str = "room", has_line_time: bool = True
+) -> list[float]:
     found = []
     for seed in range(args.seeds):
-        render = partial(simulate, "room", seed=seed, duration_s=args.duration, rig=rig)
-        folder = rendered_once(args.data, "room", f"{name}-{args.duration:g}s-seed{seed}", render)
+        render = partial(simulate, scene, seed=seed, duration_s=args.duration, rig=rig)
+        folder = rendered_once(args.data, scene, f"{name}-{args.duration:g}s-seed{seed}", render)
         known = open_source(folder).rig
         if not has_line_time:
             known = known.with_cameras(lambda camera: replace(camera, line_time_us=0.0))
         found.append(ate_mm(folder, known, Config()))
-        log_progress(f"{name}, seed {seed}: {found[-1]:.2f} mm")
+        log_progress(f"{name}, {scene}, seed {seed}: {found[-1]:.2f} mm")
     return found
