@@ -1,7 +1,7 @@
 """Masks of images: by a function, from files beside the images, from topics; and those of cameras."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,10 @@ from graphvio.sessions.writer import SessionWriter
 from graphvio.sources import Source
 
 
-def estimates_of(walk: Path, image_mask: ImageMask | None, frames: int | None = None) -> Iterator[Estimate]:
-    source = open_source(walk)
+def estimates_of(
+    walk: Path, image_mask: ImageMask | None, frames: int | None = None, pairs: Sequence[int] = (0, 1)
+) -> Iterator[Estimate]:
+    source = open_source(walk, open_source(walk).rig.with_pairs(pairs))
     odometry = Odometry(source.rig, image_mask=image_mask)
     estimates = (estimate for estimate in map(odometry.process, source) if estimate is not None)
     yield from itertools.islice(estimates, frames)
@@ -60,6 +62,8 @@ def test_masked_pixels_hold_no_tracks(room_walk: Path) -> None:
 
 
 def test_a_mask_over_a_third_of_each_image_costs_little_accuracy(room_walk: Path) -> None:
+    """With both pairs and each alone, together: the error of one run is some tenths of a millimetre, by chance."""
+
     def standing(camera: str, image: Image) -> Bool:
         mask = np.ones(image.shape, dtype=bool)
         mask[:, image.shape[1] // 3 : 2 * image.shape[1] // 3] = False
@@ -67,14 +71,15 @@ def test_a_mask_over_a_third_of_each_image_costs_little_accuracy(room_walk: Path
 
     truth_file = open_source(room_walk).truth
     assert truth_file is not None
-    ates_m = []
-    for image_mask in (None, standing):
-        posed = [e for e in estimates_of(room_walk, image_mask) if e.nav_T_body is not None]
+    ates_m: dict[bool, list[float]] = {False: [], True: []}
+    for is_masked, pairs in itertools.product(ates_m, ((0, 1), (0,), (1,))):
+        estimates = estimates_of(room_walk, standing if is_masked else None, pairs=pairs)
+        posed = [e for e in estimates if e.nav_T_body is not None]
         poses: Float = np.array([e.nav_T_body for e in posed])
         estimated = Trajectory(np.array([e.stamp_ns for e in posed], dtype=np.int64), poses)
-        ates_m.append(evaluate(estimated, load_trajectory(truth_file)).ate_position_m.rmse)
-    assert ates_m[1] < 1.3 * ates_m[0]
-    assert ates_m[1] < 0.003
+        ates_m[is_masked].append(evaluate(estimated, load_trajectory(truth_file)).ate_position_m.rmse)
+    assert sum(ates_m[True]) < 1.3 * sum(ates_m[False])
+    assert max(ates_m[True]) < 0.003
 
 
 def test_none_is_no_mask(room_walk: Path) -> None:
