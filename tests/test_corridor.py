@@ -30,11 +30,13 @@ def corridor() -> Path:
     return rendered_once("corridor", write, "240x180", DURATION_S)
 
 
-@pytest.mark.parametrize(("pairs", "max_ate_percent"), [([0, 1], 0.1), ([0], 0.2), ([1], 0.2)])
+@pytest.mark.parametrize(
+    ("pairs", "max_ate_percent", "max_drift_percent"), [([0, 1], 0.1, 0.2), ([0], 0.2, 1.0), ([1], 0.2, None)]
+)
 def test_run_corridor_has_no_reset_and_bounded_drift(
-    corridor: Path, tmp_path: Path, pairs: list[int], max_ate_percent: float
+    corridor: Path, tmp_path: Path, pairs: list[int], max_ate_percent: float, max_drift_percent: float | None
 ) -> None:
-    """By the whole path: the error of its end alone varies threefold with the noise of the images."""
+    """The back pair alone ends 0.5 to 1.0 % of the path off, with the noise of the images: that has no bound."""
     rig = open_source(corridor).rig.with_pairs(pairs)
     with ResultWriter(tmp_path / "out", rig, Config().to_yaml()) as writer:
         summary = run(open_source(corridor, rig), Config(), writer)
@@ -43,5 +45,7 @@ def test_run_corridor_has_no_reset_and_bounded_drift(
     assert summary.status["coasting"] >= 20  # a second at the bend, where neither pair sees texture
     assert summary.evaluation is not None
     assert summary.evaluation["ate_percent"] < max_ate_percent
+    if max_drift_percent is not None:
+        assert summary.evaluation["drift_percent"] < max_drift_percent
     kinds = {json.loads(line)["kind"] for line in (tmp_path / "out/events.jsonl").read_text().splitlines()}
     assert not kinds & {"lost", "new_epoch", "calibration_corrected", "calibration_changed"}
