@@ -43,7 +43,7 @@ _NOTABLE = (
     EventKind.WINDOW_REBUILT,
     EventKind.NOT_INITIALISED,
 )
-"""Wrong with exact files, as nothing fails, jumps or is knocked here; single cameras may not be initialised for long."""
+"""Wrong with exact files, as nothing fails or jumps here; single cameras may not be initialised for long."""
 
 
 _KINDS: dict[str, Callable[[RandomRig], bool]] = {
