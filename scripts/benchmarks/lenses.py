@@ -78,7 +78,7 @@ def run_all(args: argparse.Namespace) -> None:
     }
     report.table(("shutter", "ATE, mm, median", "worst", "over global"), _rows(shutters, "global"))
     fisheyes = {
-        (name, scene): _ates_mm(args, name.replace(", ", "-"), fisheye_rig(*lens), scene)
+        (name, scene): _ates_mm(args, name.split(",")[0], fisheye_rig(*lens), scene)
         for name, lens in _FISHEYES.items()
         for scene in ("room", "corridor")
     }
