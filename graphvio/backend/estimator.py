@@ -51,16 +51,18 @@ class StateEstimator(Protocol):
 
     Attributes:
         epoch: Number of declared breaks until now.
-        covariance: Covariance of the newest state.
         gate_results: Outcomes of the innovation tests since the last prediction, by the name of what was measured, see
             `graphvio.measurements.estimate.Estimate`.
         initialisations: Number of initialisations and reinitialisations until now; resets of velocities do not count.
     """
 
     epoch: int
-    covariance: StateCovariance
     gate_results: dict[str, GateResult]
     initialisations: int
+
+    @property
+    def covariance(self) -> StateCovariance:
+        """Covariance of the newest state."""
 
     @property
     def is_initialised(self) -> bool:

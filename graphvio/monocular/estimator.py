@@ -7,14 +7,13 @@ the scale. Until an `Initialiser` knows it there is no pose.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Float
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
 from graphvio.backend.initialisation import initial_attitude
-from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
+from graphvio.backend.states import RigState, StateCovariance
 from graphvio.config import Config
 from graphvio.geometry import se3, se3_inverse
 from graphvio.measurements.estimate import Status
@@ -23,48 +22,21 @@ from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, Sighting, VisualResult
 from graphvio.measurements.window_views import FirstWindow, WindowViews
-from graphvio.monocular.adjustment import (
-    Adjusted,
-    Measurements,
-    adjust,
-    covariance_of,
-    views_only,
-)
-from graphvio.monocular.calibration import WindowCalibration, time_offset_s
-from graphvio.monocular.initialiser import (
-    MAX_DURATION_NS,
-    MAX_ERROR2,
-    MAX_KEYFRAMES,
-    Initialiser,
-    Window,
-    shared_points,
-)
-from graphvio.monocular.marginalisation import first_window, without_first
+from graphvio.monocular.calibration import WindowCalibration
+from graphvio.monocular.initialiser import MAX_DURATION_NS, Initialiser, shared_points
 from graphvio.monocular.overlap_trust import OverlapTrust, alone
-from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
-from graphvio.monocular.sightings import far_off
-from graphvio.monocular.states import States
-from graphvio.monocular.structure import Structure
+from graphvio.monocular.window import Window
+from graphvio.monocular.window_solver import FIRST_SIGMA_PX, Solution, WindowSolver, newest_state
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 
-_FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
-_NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
-_NOISE_GAIN = 0.1  # of one keyframe
-_RAYLEIGH_MEDIAN = 1.1774
-_STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
-_MAX_OFF = 0.3
-_MIN_LANDMARKS = 8  # that constrain the newest state
-_MIN_FITTING = 0.3  # share of the landmarks
 _MAX_CONTRADICTION_NS = 1_000_000_000
 _MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
 _REPORT_AFTER_NS = 5_000_000_000
 _TURNS_OTHERWISE = "the IMU turns otherwise than the cameras"
-_POSE_AND_GRAVITY = np.r_[0:6, 9:12]
-_NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
 
 
 class MonocularEstimator:
@@ -79,7 +51,6 @@ class MonocularEstimator:
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
         assert rig.imu is not None
         self.epoch = 0
-        self.covariance = _NO_COVARIANCE
         self.gate_results: dict[str, GateResult] = {}
         self.initialisations = 0
         self._config = config
@@ -88,9 +59,9 @@ class MonocularEstimator:
         self._rig = rig
         self._calibration = WindowCalibration(rig, config.estimates_calibration)
         self._samples = self._new_samples()
+        self._solver = WindowSolver(self._cameras, self._calibration, self._samples)
         self._shift_ns = 0  # of samples' stamps, for what the time offset was corrected by
         self._has_imu = self._is_initialised = self._is_imu_doubted = False
-        self._sigma_px = _FIRST_SIGMA_PX
         self._collect_keyframes()
         self._has_overlaps, self._are_trusted = False, True
         self._window: Window | None = None
@@ -105,10 +76,6 @@ class MonocularEstimator:
         self._contradicted_since_ns: int | None = None
         self._awaits_imu = False
         self._rate: Float | None = None
-        self._solved: Solved | None = None
-        self._final: list[tuple[int, Float]] = []
-        self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
-        self._first_pose_ns = 0  # of the epoch
 
     # ------------------------------------------------------------------ what is known
 
@@ -137,12 +104,16 @@ class MonocularEstimator:
         """Stamp of the newest frameset."""
         return self._latest_ns
 
+    @property
+    def covariance(self) -> StateCovariance:
+        """Covariance of the newest state; zero while there is none."""
+        return self._solver.covariance
+
     def state(self) -> RigState:
         """Return the newest state."""
         if self._window is None:
             return RigState(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3))
-        states = self._window.states
-        return RigState(states.poses[-1], states.velocities[-1], states.biases[:3], states.biases[3:], states.gravity)
+        return newest_state(self._window.states)
 
     def latest_rate(self) -> Float | None:
         """Return the mean angular rate (3,) rad/s over the newest step, or None if it is not known."""
@@ -164,16 +135,15 @@ class MonocularEstimator:
 
     def covariance_since(self, then_ns: int) -> Float | None:
         """Return the covariance (6, 6) of the motion since a keyframe of the window, in body at the newest state."""
-        return None if self._solved is None else covariance_since(self._solved, then_ns)
+        return self._solver.covariance_since(then_ns)
 
     def located_points(self) -> dict[int, LocatedPoints]:
         """Return the points that the newest state sees, by camera."""
-        return {} if self._solved is None else located_points(self._solved)
+        return self._solver.located_points()
 
     def take_final(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` of keyframes that left the window since the last call."""
-        taken, self._final = self._final, []
-        return taken
+        return self._solver.take_final()
 
     def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
         """Hand over the views of each landmark once, when it leaves the window, or the window ends.
@@ -183,22 +153,14 @@ class MonocularEstimator:
         Args:
             on_views: called within `update` and `finish`.
         """
-        self._on_views = on_views
+        self._solver.on_views(on_views)
 
     def finish(self) -> None:
         """Declare all poses of the window final."""
-        if self._window is None and self._is_initialised and not self._first_pose_ns and not self._is_reported:
+        if self._window is None and self._is_initialised and not self._solver.first_pose_ns and not self._is_reported:
             self._report_not_initialised(self._latest_ns)
         if self._window is not None:
-            if self._on_views is not None:
-                while self._window.states.stamps_ns[0] < self._first_pose_ns:
-                    self._forget_first(self._window)
-            states = self._window.states
-            if self._on_views is not None:
-                cameras = states.cameras(self._cameras)
-                structure, places, _ = self._window.landmarks.structure(self._window.views, states.poses, cameras)
-                self._hand_over(structure, states, places)
-            self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
+            self._solver.end(self._window)
 
     # ------------------------------------------------------------------ one frameset
 
@@ -246,15 +208,11 @@ class MonocularEstimator:
         if interval is not None:
             self._rate = interval.mean_rate - states.biases[:3]
         self._before = int(states.stamps_ns[-1]), pose
-        n = len(states.poses) if self._is_keyframe or len(states.poses) < 2 else len(states.poses) - 1
-        del window.views[n:], window.stationary[n:]
-        window.states = replace(
-            states,
-            stamps_ns=np.append(states.stamps_ns[:n], stamp_ns),
-            poses=np.concatenate([states.poses[:n], se3(pose[:3, :3] @ step.rotation, moved)[None]]),
-            velocities=np.concatenate(
-                [states.velocities[:n], (velocity + dt * states.gravity + pose[:3, :3] @ step.velocity)[None]]
-            ),
+        window.add_state(
+            stamp_ns,
+            se3(pose[:3, :3] @ step.rotation, moved),
+            velocity + dt * states.gravity + pose[:3, :3] @ step.velocity,
+            instead=not self._is_keyframe,
         )
         return False
 
@@ -309,8 +267,8 @@ class MonocularEstimator:
 
     def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Begin with a window whose scale is known."""
-        self._window, self._is_keyframe, self._before, self._first_pose_ns = window, True, None, stamp_ns
-        self._calibration.begin(window.factors)
+        self._window, self._is_keyframe, self._before = window, True, None
+        self._solver.begin(window, stamp_ns)
         self.initialisations += 1
         self._report(
             stamp_ns,
@@ -340,110 +298,15 @@ class MonocularEstimator:
 
     def _solve(self, window: Window, stamp_ns: int, is_keyframe: bool, is_new: bool = False) -> StateUpdate:
         if not is_new:
-            window.views.append(window.names.join(self._sightings))
-            window.stationary.append(self._is_stationary)
-        self._is_keyframe, calibration = is_keyframe, self._calibration
-        cameras = window.states.cameras(self._cameras)
-        structure, places, ids = window.landmarks.structure(window.views, window.states.poses, cameras)
-        measured = self._measured(window, structure)
-        steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
-        adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
-        if is_keyframe and calibration.doubts_file(measured, adjusted, window.prior):
-            adjusted = adjust(
-                measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS, calibration.file()
-            )
-        window.states = adjusted.states
-        self._samples.time_offset_s = time_offset_s(adjusted.states.calibration)
-        window.landmarks.put(adjusted.landmarks)
-        off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
-        newest = window.views[-1]
-        seen = np.isin(ids, newest.landmark)
-        fitting = int((seen & ~off).sum())
-        is_tracking = fitting >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
-        dropped = window.names.tracks_of(ids[off])
-        window.names.end(ids[off])
-        window.views = [views.without(ids[off]) for views in window.views]
-        if is_tracking:
-            self._leave_out_mismatches(window, structure, ids, adjusted.equations.errors2)
-        self._solved = Solved(adjusted, structure, ids, window.views[-1])
-        self._set_covariance(adjusted)
-        if is_keyframe:
-            calibration.note(stamp_ns, adjusted.states, self.covariance)
-            self._finish_keyframe(window, adjusted)
-        status = self._status(stamp_ns, is_tracking, adjusted)
-        return StateUpdate(status, outliers=dropped)
+            window.add_views(self._sightings, self._is_stationary)
+        self._is_keyframe = is_keyframe
+        solution = self._solver.solve(window, stamp_ns, is_keyframe)
+        return StateUpdate(self._status(stamp_ns, solution), outliers=solution.dropped)
 
-    def _leave_out_mismatches(self, window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
-        """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
-        rows = np.flatnonzero((structure.state == len(window.views) - 1) & (errors2 > MAX_ERROR2))
-        if not len(rows):
-            return
-        landmarks = ids[np.searchsorted(structure.rows, rows, side="right") - 1]
-        newest = window.views[-1]
-        window.views[-1] = kept = newest.without_adopted(landmarks, structure.camera[rows])
-        window.names.end(np.setdiff1d(newest.landmark, kept.landmark))
-
-    def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
-        """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
-        window.names.note_keyframe()
-        if len(adjusted.equations.errors2):
-            noise = np.sqrt(np.median(adjusted.equations.errors2)) / _RAYLEIGH_MEDIAN * self._sigma_px
-            wanted = float(np.clip(_NOISE_FACTOR * noise, _MIN_SIGMA_PX, _MAX_SIGMA_PX))
-            self._sigma_px += _NOISE_GAIN * (wanted - self._sigma_px)
-        while len(window.states.poses) > MAX_KEYFRAMES:
-            self._forget_first(window)
-
-    def _forget_first(self, window: Window) -> None:
-        states = window.states
-        structure, places, ids = window.landmarks.structure(window.views, states.poses, states.cameras(self._cameras))
-        leaving = np.isin(ids, window.views[0].landmark)
-        measured = self._measured(window, structure.of(leaving))
-        is_before = int(states.stamps_ns[0]) < self._first_pose_ns
-        if not is_before:
-            self._hand_over(measured.structure, states, places[leaving])
-        walk = self._calibration.walk((states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9)
-        window.prior = without_first(measured, states, places[leaving], window.prior, walk)
-        window.names.end(window.views[0].landmark)
-        window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
-        del window.stationary[0]
-        self._final.append((int(states.stamps_ns[0]), states.poses[0]))
-        window.states = states.of(np.arange(1, len(states.poses)))
-        if is_before and window.states.stamps_ns[0] >= self._first_pose_ns and self._on_views is not None:
-            self._on_views(first_window(window.prior))
-
-    def _hand_over(self, structure: Structure, states: States, places: Float) -> None:
-        """Hand over the views of some landmarks (L, 3), which no window will use again."""
-        if self._on_views is None or not len(places):
-            return
-        information, gradient = views_only(states.cameras(self._cameras), structure, self._sigma_px, states, places)
-        kept = np.isin(np.arange(len(states.poses)), structure.state)
-        rows = np.repeat(kept, 6)
-        self._on_views(
-            WindowViews(states.stamps_ns[kept], states.poses[kept], information[np.ix_(rows, rows)], gradient[rows])
-        )
-
-    def _measured(self, window: Window, structure: Structure) -> Measurements:
-        samples = self._samples.between(window.states.stamps_ns, self._calibration.is_file_exact)
-        return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
-
-    def _set_covariance(self, adjusted: Adjusted) -> None:
-        """Keep the covariance of the newest state."""
-        n = len(adjusted.states.poses)
-        pose, velocity, common = 6 * (n - 1) + np.arange(6), 9 * n - 3 + np.arange(3), 9 * n + np.arange(9)
-        joint = covariance_of(adjusted.equations.hessian, np.concatenate([pose, velocity, common]))
-        self.covariance = StateCovariance(
-            pose=joint[:6, :6],
-            velocity=joint[6:9, 6:9],
-            gravity=joint[9:12, 9:12],
-            gyro_bias=joint[12:15, 12:15],
-            accel_bias=joint[15:, 15:],
-            tilt=tilt_covariance(self.state(), joint[np.ix_(_POSE_AND_GRAVITY, _POSE_AND_GRAVITY)]),
-        )
-
-    def _status(self, stamp_ns: int, is_tracking: bool, adjusted: Adjusted) -> Status:
+    def _status(self, stamp_ns: int, solution: Solution) -> Status:
         """Return the status; images and IMU that contradict each other for long end the epoch."""
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(self.covariance.pose[3:, 3:])[-1]))
-        errors2 = adjusted.equations.imu_errors2
+        errors2 = solution.imu_errors2
         contradicts = bool(len(errors2) and not errors2[-1] < _MAX_IMU_ERROR2)
         if contradicts:
             since_ns = self._contradicted_since_ns or stamp_ns
@@ -453,7 +316,7 @@ class MonocularEstimator:
                 return Status.LOST
         else:
             self._contradicted_since_ns = None
-        if is_tracking:
+        if solution.is_tracking:
             self._tracked_sigma_m = sigma_m
             return Status.TRACKING
         gained_m = float(np.sqrt(max(sigma_m**2 - self._tracked_sigma_m**2, 0.0)))
@@ -477,9 +340,8 @@ class MonocularEstimator:
             self.epoch += 1
             self._report(stamp_ns, EventKind.LOST, why)
         self._window, self._before, self._contradicted_since_ns = None, None, None
-        self._solved = None
+        self._solver.forget()
         self._collect_keyframes()
-        self.covariance = _NO_COVARIANCE
         self._since_ns, self._is_reported = stamp_ns, False
 
     def restart_imu(self, stamp_ns: int) -> None:
@@ -487,6 +349,7 @@ class MonocularEstimator:
         self._lose(stamp_ns, "the IMU's clock is corrected")
         self._calibration = WindowCalibration(self._rig, self._config.estimates_calibration)
         self._samples, self._shift_ns = self._new_samples(), 0
+        self._solver.calibration, self._solver.samples = self._calibration, self._samples
         self._are_trusted = True
         self._collect_keyframes()
 
@@ -507,7 +370,7 @@ class MonocularEstimator:
         return SampleBuffer(imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6))
 
     def _new_initialiser(self, doubts_file: bool = True) -> Initialiser:
-        return Initialiser(self._cameras, self._calibration, self._samples.between, _FIRST_SIGMA_PX, doubts_file)
+        return Initialiser(self._cameras, self._calibration, self._samples.between, FIRST_SIGMA_PX, doubts_file)
 
     def _oldest_needed_ns(self, stamp_ns: int) -> int:
         """Return the stamp from which on IMU samples are needed at a frameset."""

@@ -8,7 +8,7 @@ those that the noise accounts for.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,20 +23,18 @@ from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
-from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
+from graphvio.monocular.sightings import LandmarkNames, Landmarks, far_off
 from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import located
+from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, Window
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
 
-MAX_KEYFRAMES = 14
 MAX_SCALE_SIGMA = 0.05
-MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still
 _MIN_KEYFRAMES, _MIN_METRIC_KEYFRAMES = 8, 5  # the latter where baselines know the scale
 _MIN_DURATION_S, _MIN_METRIC_DURATION_S = 1.0, 0.5
 MAX_DURATION_NS = 5_000_000_000
 _MIN_LANDMARKS = 20
-_MAX_OFF = 0.3  # share of a landmark's views that may be farther off
 _MIN_FITTING = 0.7  # share of the landmarks
 _MAX_IMU_ERROR2 = 60.0  # squared whitened error of an interval, of 9 dimensions
 _MAX_GRAVITY_EXCESS = 0.1  # m/s^2
@@ -48,29 +46,6 @@ _FIRST_DOUBT = 3  # windows that fit no motion with an exact file, until that is
 _OTHER_SCALES = (0.6, 1.7)
 _MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
 POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
-
-
-@dataclass(eq=False)
-class Window:
-    """States of a window with what was seen from them.
-
-    Attributes:
-        states: in time order.
-        views: of each.
-        stationary: whether the rig stood there.
-        names: joins tracks to landmarks.
-        landmarks: where these are.
-        prior: what is known from before.
-        factors: (G,) by which the rig file's errors exceed its standard deviations.
-    """
-
-    states: States
-    views: list[Views]
-    stationary: list[bool]
-    names: LandmarkNames
-    landmarks: Landmarks
-    prior: Prior | None
-    factors: Float
 
 
 class Initialiser:
@@ -195,7 +170,7 @@ class Initialiser:
             adjusted = adjust(measured, states, places, prior, _STEPS, file)
             states = adjusted.states
             landmarks.put(adjusted.landmarks)
-            off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
+            off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, MAX_OFF)
             if file is not None and is_first:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
                 file = self._calibration.file(factors)

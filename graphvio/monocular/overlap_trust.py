@@ -12,8 +12,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphvio.measurements.motion import Sighting
-from graphvio.monocular.initialiser import Initialiser, Window
+from graphvio.monocular.initialiser import Initialiser
 from graphvio.monocular.states import States
+from graphvio.monocular.window import Window
 
 _MAX_SIGMAS = 4.0
 _MIN_OFF = 0.025  # seconds after the scale is known, the IMU alone was at most 2.3 % off

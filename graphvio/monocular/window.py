@@ -1,0 +1,64 @@
+"""Window of keyframes with the landmarks that they see: the state of a rig of single cameras and an IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.measurements.motion import Sighting
+from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views
+from graphvio.monocular.states import Prior, States
+
+MAX_KEYFRAMES = 14
+MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still
+MAX_OFF = 0.3  # share of a landmark's views that may be farther off
+
+
+@dataclass(eq=False)
+class Window:
+    """States of a window with what was seen from them.
+
+    Attributes:
+        states: in time order.
+        views: of each.
+        stationary: whether the rig stood there.
+        names: joins tracks to landmarks.
+        landmarks: where these are.
+        prior: what is known from before.
+        factors: (G,) by which the rig file's errors exceed its standard deviations.
+    """
+
+    states: States
+    views: list[Views]
+    stationary: list[bool]
+    names: LandmarkNames
+    landmarks: Landmarks
+    prior: Prior | None
+    factors: Float
+
+    def add_state(self, stamp_ns: int, pose: Float, velocity: Float, instead: bool) -> None:
+        """Add a predicted state: after the newest one, or instead of it where that is no keyframe.
+
+        Args:
+            stamp_ns: of its frameset.
+            pose: ``nav_T_body`` (4, 4).
+            velocity: (3,) m/s in nav.
+            instead: whether the newest state leaves.
+        """
+        states = self.states
+        n = len(states.poses) - 1 if instead and len(states.poses) > 1 else len(states.poses)
+        del self.views[n:], self.stationary[n:]
+        self.states = replace(
+            states,
+            stamps_ns=np.append(states.stamps_ns[:n], stamp_ns),
+            poses=np.concatenate([states.poses[:n], pose[None]]),
+            velocities=np.concatenate([states.velocities[:n], velocity[None]]),
+        )
+
+    def add_views(self, sightings: Mapping[int, Sighting], is_stationary: bool) -> None:
+        """Add what the cameras see from the newest state: camera -> tracks."""
+        self.views.append(self.names.join(sightings))
+        self.stationary.append(is_stationary)

@@ -1,0 +1,246 @@
+"""Fixed-lag smoothing of a rig of single cameras: a window is solved at each frameset, and its oldest keyframe leaves.
+
+What leaves is marginalised, and stays as a prior on the states that have seen the same landmarks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
+from graphvio.measurements.motion import LocatedPoints
+from graphvio.measurements.window_views import FirstWindow, WindowViews
+from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, covariance_of, views_only
+from graphvio.monocular.calibration import WindowCalibration, time_offset_s
+from graphvio.monocular.marginalisation import first_window, without_first
+from graphvio.monocular.points import Solved, covariance_since, located_points
+from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.sample_buffer import SampleBuffer
+from graphvio.monocular.sightings import far_off
+from graphvio.monocular.states import States
+from graphvio.monocular.structure import Structure
+from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, Window
+
+FIRST_SIGMA_PX = 0.3
+_MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.12, 0.6
+_NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
+_NOISE_GAIN = 0.1  # of one keyframe
+_RAYLEIGH_MEDIAN = 1.1774
+_STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
+_MIN_LANDMARKS = 8  # that constrain the newest state
+_MIN_FITTING = 0.3  # share of the landmarks
+_POSE_AND_GRAVITY = np.r_[0:6, 9:12]
+NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
+
+
+class Solution(NamedTuple):
+    """What a frameset's solution says.
+
+    Attributes:
+        imu_errors2: squared whitened errors of the IMU between the states.
+        is_tracking: whether enough landmarks constrain the newest state.
+        dropped: index of the camera -> tracks that do not stand still.
+    """
+
+    imu_errors2: Float
+    is_tracking: bool
+    dropped: Mapping[int, Int]
+
+
+class WindowSolver:
+    """Solver of a rig's windows, one after the other.
+
+    Args:
+        cameras: of the rig.
+        calibration: of the rig, with what is known of it.
+        samples: of the IMU.
+
+    Attributes:
+        calibration: as above; another one may be used from the next window on.
+        samples: as above; likewise.
+        covariance: of the newest state.
+        first_pose_ns: stamp of the window's first pose, 0 before the first window.
+    """
+
+    def __init__(self, cameras: Cameras, calibration: WindowCalibration, samples: SampleBuffer) -> None:
+        self.calibration = calibration
+        self.samples = samples
+        self.covariance = NO_COVARIANCE
+        self.first_pose_ns = 0
+        self._cameras = cameras
+        self._sigma_px = FIRST_SIGMA_PX
+        self._solved: Solved | None = None
+        self._final: list[tuple[int, Float]] = []
+        self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
+
+    # ------------------------------------------------------------------ what is known
+
+    def covariance_since(self, then_ns: int) -> Float | None:
+        """Return the covariance (6, 6) of the motion since a keyframe of the window, in body at the newest state."""
+        return None if self._solved is None else covariance_since(self._solved, then_ns)
+
+    def located_points(self) -> dict[int, LocatedPoints]:
+        """Return the points that the newest state sees, by camera."""
+        return {} if self._solved is None else located_points(self._solved)
+
+    def take_final(self) -> list[tuple[int, Float]]:
+        """Return stamps and poses ``nav_T_body`` of keyframes that left the window since the last call."""
+        taken, self._final = self._final, []
+        return taken
+
+    def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
+        """Hand over the views of each landmark once, when it leaves the window, or the window ends."""
+        self._on_views = on_views
+
+    # ------------------------------------------------------------------ one window
+
+    def begin(self, window: Window, stamp_ns: int) -> None:
+        """Take the window of an epoch's first pose, at a frameset."""
+        self.first_pose_ns = stamp_ns
+        self.calibration.begin(window.factors)
+
+    def solve(self, window: Window, stamp_ns: int, is_keyframe: bool) -> Solution:
+        """Solve for the states and landmarks, and leave out what does not stand still.
+
+        Args:
+            window: with the newest state and what is seen from it.
+            stamp_ns: of the newest state.
+            is_keyframe: whether it stays.
+
+        Raises:
+            numpy.linalg.LinAlgError: if the measurements do not determine them.
+        """
+        calibration = self.calibration
+        structure, places, ids = self._structure(window)
+        measured = self._measured(window, structure)
+        steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
+        adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
+        if is_keyframe and calibration.doubts_file(measured, adjusted, window.prior):
+            adjusted = adjust(
+                measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS, calibration.file()
+            )
+        window.states = adjusted.states
+        self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
+        window.landmarks.put(adjusted.landmarks)
+        is_tracking, dropped = self._leave_out_moving(window, structure, ids, adjusted.equations.errors2)
+        self._solved = Solved(adjusted, structure, ids, window.views[-1])
+        self.covariance = _newest_covariance(adjusted)
+        if is_keyframe:
+            calibration.note(stamp_ns, adjusted.states, self.covariance)
+            self._finish_keyframe(window, adjusted)
+        return Solution(adjusted.equations.imu_errors2, is_tracking, dropped)
+
+    def end(self, window: Window) -> None:
+        """Declare all poses of the window final, and hand its landmarks over."""
+        if self._on_views is not None:
+            while window.states.stamps_ns[0] < self.first_pose_ns:
+                self._forget_first(window)
+        states = window.states
+        if self._on_views is not None:
+            structure, places, _ = self._structure(window)
+            self._hand_over(structure, states, places)
+        self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
+
+    def forget(self) -> None:
+        """Forget what the last window said of the newest state."""
+        self._solved, self.covariance = None, NO_COVARIANCE
+
+    # ------------------------------------------------------------------ parts of these steps
+
+    def _structure(self, window: Window) -> tuple[Structure, Float, Int]:
+        """Return the window's landmarks, where they are (L, 3), and their identities (L,)."""
+        states = window.states
+        return window.landmarks.structure(window.views, states.poses, states.cameras(self._cameras))
+
+    def _measured(self, window: Window, structure: Structure) -> Measurements:
+        samples = self.samples.between(window.states.stamps_ns, self.calibration.is_file_exact)
+        return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
+
+    def _leave_out_moving(
+        self, window: Window, structure: Structure, ids: Int, errors2: Float
+    ) -> tuple[bool, Mapping[int, Int]]:
+        """End landmarks that do not stand still: whether enough others are seen, and which tracks these were."""
+        off = far_off(structure, errors2, MAX_ERROR2, MAX_OFF)
+        seen = np.isin(ids, window.views[-1].landmark)
+        is_tracking = int((seen & ~off).sum()) >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
+        dropped = window.names.tracks_of(ids[off])
+        window.names.end(ids[off])
+        window.views = [views.without(ids[off]) for views in window.views]
+        if is_tracking:
+            _leave_out_mismatches(window, structure, ids, errors2)
+        return is_tracking, dropped
+
+    def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
+        """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
+        window.names.note_keyframe()
+        if len(adjusted.equations.errors2):
+            noise = np.sqrt(np.median(adjusted.equations.errors2)) / _RAYLEIGH_MEDIAN * self._sigma_px
+            wanted = float(np.clip(_NOISE_FACTOR * noise, _MIN_SIGMA_PX, _MAX_SIGMA_PX))
+            self._sigma_px += _NOISE_GAIN * (wanted - self._sigma_px)
+        while len(window.states.poses) > MAX_KEYFRAMES:
+            self._forget_first(window)
+
+    def _forget_first(self, window: Window) -> None:
+        """Marginalise the oldest state and the landmarks that it sees."""
+        states = window.states
+        structure, places, ids = self._structure(window)
+        leaving = np.isin(ids, window.views[0].landmark)
+        measured = self._measured(window, structure.of(leaving))
+        is_before = int(states.stamps_ns[0]) < self.first_pose_ns
+        if not is_before:
+            self._hand_over(measured.structure, states, places[leaving])
+        walk = self.calibration.walk((states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9)
+        window.prior = without_first(measured, states, places[leaving], window.prior, walk)
+        window.names.end(window.views[0].landmark)
+        window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
+        del window.stationary[0]
+        self._final.append((int(states.stamps_ns[0]), states.poses[0]))
+        window.states = states.of(np.arange(1, len(states.poses)))
+        if is_before and window.states.stamps_ns[0] >= self.first_pose_ns and self._on_views is not None:
+            self._on_views(first_window(window.prior))
+
+    def _hand_over(self, structure: Structure, states: States, places: Float) -> None:
+        """Hand over the views of some landmarks (L, 3), which no window will use again."""
+        if self._on_views is None or not len(places):
+            return
+        information, gradient = views_only(states.cameras(self._cameras), structure, self._sigma_px, states, places)
+        kept = np.isin(np.arange(len(states.poses)), structure.state)
+        rows = np.repeat(kept, 6)
+        self._on_views(
+            WindowViews(states.stamps_ns[kept], states.poses[kept], information[np.ix_(rows, rows)], gradient[rows])
+        )
+
+
+def newest_state(states: States) -> RigState:
+    """Return the newest of a window's states."""
+    return RigState(states.poses[-1], states.velocities[-1], states.biases[:3], states.biases[3:], states.gravity)
+
+
+def _newest_covariance(adjusted: Adjusted) -> StateCovariance:
+    """Return the covariance of the newest state."""
+    n = len(adjusted.states.poses)
+    pose, velocity, common = 6 * (n - 1) + np.arange(6), 9 * n - 3 + np.arange(3), 9 * n + np.arange(9)
+    joint = covariance_of(adjusted.equations.hessian, np.concatenate([pose, velocity, common]))
+    return StateCovariance(
+        pose=joint[:6, :6],
+        velocity=joint[6:9, 6:9],
+        gravity=joint[9:12, 9:12],
+        gyro_bias=joint[12:15, 12:15],
+        accel_bias=joint[15:, 15:],
+        tilt=tilt_covariance(newest_state(adjusted.states), joint[np.ix_(_POSE_AND_GRAVITY, _POSE_AND_GRAVITY)]),
+    )
+
+
+def _leave_out_mismatches(window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
+    """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
+    rows = np.flatnonzero((structure.state == len(window.views) - 1) & (errors2 > MAX_ERROR2))
+    if not len(rows):
+        return
+    landmarks = ids[np.searchsorted(structure.rows, rows, side="right") - 1]
+    newest = window.views[-1]
+    window.views[-1] = kept = newest.without_adopted(landmarks, structure.camera[rows])
+    window.names.end(np.setdiff1d(newest.landmark, kept.landmark))
