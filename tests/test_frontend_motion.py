@@ -286,6 +286,24 @@ def test_refine_of_far_points_leaves_translation_uncertain() -> None:
     assert sigmas[3:].min() > 1.0
 
 
+@pytest.mark.parametrize("number", [353, 369, 413, 1599, 1909, 2127, 2193, 2919])
+def test_points_behind_a_camera_are_no_inliers_of_a_motion_that_fits_nothing(number: int) -> None:
+    rng, rig = seed(number), RIG.with_pairs([0])
+    count = int(rng.integers(8, 60))
+    seen = seen_points(rig, TRUTH, count, rng)
+    points = np.column_stack([seen.points[:, :2], rng.uniform(0.02, 3.0, count)])
+    seen = seen._replace(
+        points=points,
+        covariances=seen.covariances * np.exp(rng.uniform(0.0, 12.0)),  # depths are hardly known
+        left=seen.left + rng.normal(0.0, 0.05, seen.left.shape),
+        has_right=rng.random(count) < rng.random(),
+    )
+    start = transform(rng.normal(0.0, 0.2, 3), rng.normal(0.0, 1.0, 3))
+    refined = refine(RigArrays.of(rig), seen, start, CONFIG)
+    assert np.isfinite(refined.errors_px[refined.inlier]).all()
+    assert np.isfinite(refined.covariance).all()
+
+
 # ------------------------------------------------------------------ one, two, and swapped pairs
 
 

@@ -10,7 +10,7 @@ from the paper even then is the covariance: it is that of the inliers, with the 
 the noise that the residuals show, and ``motion.sigma_inflation``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -91,7 +91,8 @@ def refine(
     if in_front[refined.inlier].all():
         return refined
     # The last step took points behind a camera, whose depth is hardly known: once more without them.
-    return Refined(*_refined(start, rig, observations, refined.inlier & in_front, shows_noise, *settings))
+    refined = Refined(*_refined(start, rig, observations, refined.inlier & in_front, shows_noise, *settings))
+    return replace(refined, inlier=refined.inlier & np.isfinite(refined.errors_px))
 
 
 @kernel
