@@ -50,17 +50,8 @@ COEFFICIENTS = {
     "omnidirectional": ("xi", "k1", "k2", "p1", "p2"),
 }
 """Coefficients of each model, in the order of ``distortion``."""
-N_BASIS = 5
-"""Number of coefficients, the first ones, among which are all that a model is linear in."""
-LINEAR_COEFFICIENTS = {
-    "radial-tangential": ("k1", "k2", "p1", "p2", "k3"),
-    "equidistant": ("k1", "k2", "k3", "k4"),
-    "rational": ("k1", "k2", "p1", "p2", "k3"),
-    "double-sphere": (),
-    "extended-unified": (),
-    "omnidirectional": ("k1", "k2", "p1", "p2"),
-}
-"""Those that distorted coordinates are linear in, see `distortion_basis`; the self-calibration keeps the others."""
+N_ESTIMATED = 5
+"""Number of coefficients, the first ones, that the self-calibration estimates; it keeps those of a denominator."""
 
 MAX_ANGLE_RAD = np.deg2rad(80.0)
 _MAX_TAN = float(np.tan(MAX_ANGLE_RAD))
@@ -170,9 +161,9 @@ def _sphere(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
 def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float:
     """Compute the derivatives (5, 2) of the distorted normalised coordinates of (x, y) by the first coefficients.
 
-    Zero for those that are not in `LINEAR_COEFFICIENTS`.
+    Zero for those that a model does not have, and outside its domain.
     """
-    basis = np.zeros((N_BASIS, 2))
+    basis = np.zeros((N_ESTIMATED, 2))
     if model == EQUIDISTANT:
         r2 = x * x + y * y
         r = np.sqrt(r2)
@@ -183,12 +174,20 @@ def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float
                 power *= t2
                 basis[i, 0], basis[i, 1] = x * power, y * power
         return basis
-    if model in (DOUBLE_SPHERE, EXTENDED_UNIFIED):
-        return basis
     first, scale = 0, 1.0
-    if model == OMNIDIRECTIONAL:
+    if model >= DOUBLE_SPHERE:
+        by_xi, by_alpha, by_beta = _sphere_derivatives(model, distortion, x, y)
+        if model == DOUBLE_SPHERE:
+            basis[0, 0], basis[0, 1], basis[1, 0], basis[1, 1] = x * by_xi, y * by_xi, x * by_alpha, y * by_alpha
+            return basis
+        if model == EXTENDED_UNIFIED:
+            basis[0, 0], basis[0, 1], basis[1, 0], basis[1, 1] = x * by_alpha, y * by_alpha, x * by_beta, y * by_beta
+            return basis
         first, (on_plane, _) = 1, _sphere(model, distortion, x, y)
-        x, y = x * on_plane, y * on_plane
+        u, v = x * on_plane, y * on_plane
+        _, _, a, b, c, d = _polynomial(model, distortion, u, v)
+        basis[0, 0], basis[0, 1] = (a * x + b * y) * by_xi, (c * x + d * y) * by_xi
+        x, y = u, v
     r2 = x * x + y * y
     if model == RATIONAL:
         scale = 1.0 / (1.0 + r2 * (distortion[5] + r2 * (distortion[6] + r2 * distortion[7])))
@@ -199,6 +198,22 @@ def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float
     if first == 0:
         basis[4, 0], basis[4, 1] = x * r2 * r2 * r2 * scale, y * r2 * r2 * r2 * scale
     return basis
+
+
+@kernel
+def _sphere_derivatives(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float]:
+    """Compute the derivatives of `_sphere`'s scale by xi, alpha and beta; 0 outside the model's domain."""
+    scale, _ = _sphere(model, distortion, x, y)
+    if not scale > 0.0:
+        return 0.0, 0.0, 0.0
+    xi, alpha, beta = _sphere_shape(model, distortion)
+    r2 = x * x + y * y
+    d1 = np.sqrt(1.0 + r2)
+    z = 1.0 + xi * d1
+    d2 = np.sqrt(beta * r2 + z * z)
+    by_denominator = -scale * scale
+    by_xi, by_alpha, by_beta = (alpha * z / d2 + 1.0 - alpha) * d1, d2 - z, 0.5 * alpha * r2 / d2
+    return by_denominator * by_xi, by_denominator * by_alpha, by_denominator * by_beta
 
 
 @kernel

@@ -45,7 +45,7 @@ from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
-from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, is_linear, moved_cameras
+from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, has_coefficient, moved_cameras
 from graphvio.self_calibration.prior import file_prior
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
@@ -421,7 +421,7 @@ def test_a_lens_that_is_wrong_by_the_file_moves_rays_as_its_derivatives_say(mode
     rig = Rig((), default_rig().imu, singles=(SingleCamera(camera),))
     change = np.zeros(SINGLE)
     change[:PLACE] = [0.4, -0.3, 0.5, -0.2, 1e-3, -5e-4, 1e-4, 1e-4, 1e-4]
-    change[INTRINSICS:PLACE] *= is_linear(camera)
+    change[INTRINSICS:PLACE] *= has_coefficient(camera)
     moved, pixels = moved_cameras(rig, change).singles[0].left, np.array([[300.0, 200.0], [520.0, 90.0], [60.0, 400.0]])
     (by_file, _), (by_other, _) = camera.unproject(pixels), moved.unproject(pixels)
     for seen, expected in zip(by_file, by_other, strict=True):

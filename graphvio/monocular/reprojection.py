@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.cameras import N_BASIS, distort, distortion_basis
+from graphvio.cameras import N_ESTIMATED, distort, distortion_basis
 from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel
 from graphvio.rig import Rig
@@ -93,7 +93,7 @@ def _by_lens(cameras: Cameras, j: int, x: float, y: float, out: Float) -> None:
     per_fx, per_fy = 1.0 / fx, 1.0 / fy
     out[0, 0], out[1, 0], out[0, 1], out[1, 1] = xu * u * per_fx, yu * u * per_fx, xv * v * per_fy, yv * v * per_fy
     out[0, 2], out[1, 2], out[0, 3], out[1, 3] = xu * per_fx, yu * per_fx, xv * per_fy, yv * per_fy
-    for c in range(N_BASIS):
+    for c in range(N_ESTIMATED):
         out[0, INTRINSICS + c] = xu * basis[c, 0] + xv * basis[c, 1]
         out[1, INTRINSICS + c] = yu * basis[c, 0] + yv * basis[c, 1]
 

@@ -16,7 +16,7 @@ from graphvio.self_calibration.parameters import (
     CAMERA,
     INTRINSICS,
     STEREO,
-    is_linear,
+    has_coefficient,
     n_of_cameras,
     place_of,
     relative_to_first,
@@ -84,7 +84,7 @@ def _of_cameras(rig: Rig) -> Iterator[Curve]:
             focal = 100.0 / camera.intrinsics[i]
             yield Curve("focal lengths", "%", camera.name, f"f{axis}", focal * unit[at + i])
             yield Curve("principal points", "px", camera.name, f"c{axis}", unit[at + 2 + i])
-        for i in np.flatnonzero(is_linear(camera))[:_SHOWN_DISTORTION]:
+        for i in np.flatnonzero(has_coefficient(camera))[:_SHOWN_DISTORTION]:
             yield Curve("distortion", "1e-3", camera.name, f"d{i + 1}", 1e3 * unit[at + INTRINSICS + i])
 
 

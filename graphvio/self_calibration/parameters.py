@@ -1,7 +1,6 @@
 """Calibration of a rig as one vector of parameters: its layout, its prior, and rigs that differ by such a vector.
 
-Of a lens, the first five coefficients have a place in it. Those that distorted coordinates are not linear in, and all
-others, are kept: see `graphvio.cameras.LINEAR_COEFFICIENTS`.
+Of a lens, the first five coefficients have a place in it; the others, of ``rational``'s denominator, are kept.
 
 A vector is the difference from the nominal rig, that of the rig file. Rotations are rotation vectors: that of the right
 camera turns the left camera's frame, ``right_R_left Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
@@ -16,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.cameras import COEFFICIENTS, LINEAR_COEFFICIENTS, N_BASIS
+from graphvio.cameras import COEFFICIENTS, N_ESTIMATED
 from graphvio.geometry import skew, so3_exp
 from graphvio.rig import Camera, Rig, SingleCamera, StereoPair
 
-INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, N_BASIS, 3, 3
+INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, N_ESTIMATED, 3, 3
 CAMERA = INTRINSICS + DISTORTION
 LEFT, RIGHT, STEREO, BODY = 0, CAMERA, 2 * CAMERA, 2 * CAMERA + 6
 PAIR = BODY + 6
@@ -74,10 +73,9 @@ def moved_cameras(rig: Rig, difference: Float) -> Rig:
     return RigCalibration.of(rig).moved(difference).applied_to(rig)
 
 
-def is_linear(camera: Camera) -> Bool:
-    """Return which of a camera's first coefficients (DISTORTION,) are estimated: those that the model is linear in."""
-    names, linear = COEFFICIENTS[camera.model], LINEAR_COEFFICIENTS[camera.model]
-    return np.array([i < len(names) and names[i] in linear for i in range(DISTORTION)])
+def has_coefficient(camera: Camera) -> Bool:
+    """Return which of the first coefficients (DISTORTION,) a camera's model has."""
+    return np.arange(DISTORTION) < len(COEFFICIENTS[camera.model])
 
 
 def about_origin(rig: Rig, j: int) -> Float:

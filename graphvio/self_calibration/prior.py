@@ -24,7 +24,7 @@ from graphvio.self_calibration.parameters import (
     INTRINSICS,
     STEREO,
     about_origin,
-    is_linear,
+    has_coefficient,
     n_of_cameras,
     place_of,
     relative_to_first,
@@ -196,7 +196,7 @@ def _sigmas_of_lens(camera: Camera, known: CalibrationSigmas) -> Float:
     sigmas = np.zeros(CAMERA)
     sigmas[:2] = known.focal_share * camera.intrinsics[:2]
     sigmas[2:INTRINSICS] = known.principal_point_px
-    given = np.where(is_linear(camera), camera.distortion[:DISTORTION], 0.0)
+    given = np.where(has_coefficient(camera), camera.distortion[:DISTORTION], 0.0)
     size = np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)
     sigmas[INTRINSICS:] = known.distortion_share * size
     return sigmas
