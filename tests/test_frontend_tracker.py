@@ -276,9 +276,10 @@ def test_match_of_no_corner_in_the_right_image_is_rejected() -> None:
     assert rejected[1] > 2 * rejected[0]
 
 
-def test_match_margin_finds_matches_beside_wrong_epipolar_lines() -> None:
+@pytest.mark.parametrize("lower_px", [2.0, -4.5, 7.0])
+def test_match_margin_finds_matches_beside_wrong_epipolar_lines(lower_px: float) -> None:
     pair, images = rectified(), views(np.eye(4))
-    lower = replace(pair.right, intrinsics=pair.right.intrinsics + np.array([0.0, 0.0, 0.0, 2.0]))
+    lower = replace(pair.right, intrinsics=pair.right.intrinsics + np.array([0.0, 0.0, 0.0, lower_px]))
     exact = PairTracker(pair, Config()).observe(0, *images, None, None)
     tracker = PairTracker(pair, Config())
     tracker.recalibrate(replace(pair, right=lower), 0.0)

@@ -20,6 +20,9 @@ _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `Ste
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
+_MIN_FOUND = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
+_SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
+_MIN_MORE, _MIN_SHARE_MORE = 10, 0.2  # new corners that they must find beyond the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,7 @@ class StereoMatcher:
         self._allowed = allowed_right
         self._packed_right = np.zeros(allowed_right.shape, dtype=np.uint32)
         self._margin_px = 0.0  # by how much the calibration may move epipolar lines
+        self._shift_px: Float = np.zeros(2)  # of all epipolar lines, where the images show that they are off
 
     def allow(self, allowed_right: Bool) -> None:
         """Match only where (height, width) the newest right image may be used."""
@@ -79,6 +83,7 @@ class StereoMatcher:
         """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair
         self._margin_px = epipolar_margin_px
+        self._shift_px = np.zeros(2)
 
     def match(
         self,
@@ -114,7 +119,8 @@ class StereoMatcher:
         points, covariances, errors = triangulate(
             rays, normalised, pair.right_T_left, pair.left.focal_px, pair.right.focal_px
         )
-        good = passes(good, errors <= settings.max_epipolar_px + self._margin_px, "epipolar", rejected)
+        max_error_px = settings.max_epipolar_px + self._margin_px + np.sqrt(0.5) * np.linalg.norm(self._shift_px)
+        good = passes(good, errors <= max_error_px, "epipolar", rejected)
         sigma = np.sqrt(np.maximum(covariances[:, 2, 2], 0.0)) * self._config.motion.pixel_sigma_px
         in_range = (points[:, 2] <= 1.0 / settings.min_depth_m) & (points[:, 2] >= -3.0 * sigma)
         good = passes(good, in_range, "depth_range", rejected)
@@ -129,16 +135,15 @@ class StereoMatcher:
         known = np.isfinite(inverse_depths)
         nearest = 1.0 / settings.min_depth_m
         expected = np.where(known, np.minimum(np.maximum(inverse_depths, 0.0), nearest), 0.0)
-        camera = (pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion)
+        camera = _projection(pair)
         unknown = np.flatnonzero(~known)
         seen = np.ones(len(pixels), dtype=bool)
         if len(unknown):
             bounds = np.zeros((len(unknown), 2))
             bounds[:, 1] = nearest
-            expected[unknown], seen[unknown] = epipolar_search(
-                left[:2], right[:2], pixels[unknown], rays[unknown], bounds, *camera, _SEARCH_CORRELATION
-            )
+            expected[unknown], seen[unknown] = self._search_lines(left, right, pixels[unknown], rays[unknown], bounds)
         guess, directions, in_reach = epipolar_lines(rays, expected, *camera)
+        guess += self._shift_px
         found = passes(np.ones(len(pixels), dtype=bool), seen & in_reach, "search", rejected)
         half = tracking.window_px // 2
         pack(right[0], self._packed_right)
@@ -166,3 +171,40 @@ class StereoMatcher:
             )
         found = passes(found, localised, "corner", rejected)
         return matched, slopes, passes(found, returned, "left_right", rejected)
+
+    def _search_lines(
+        self, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, bounds: Float
+    ) -> tuple[Float, Bool]:
+        """Search corners (N,) along their epipolar lines: inverse depths (N,), and whether they were found (N,).
+
+        Where the calibration may be wrong and few corners are found, lines that are shifted are tried, and those by
+        which clearly more are found are kept: until the next calibration.
+        """
+        found = self._found_along(self._shift_px, left, right, pixels, rays, bounds)
+        if not self._margin_px or found[1].mean() >= _MIN_FOUND:
+            return found
+        _, directions, _ = epipolar_lines(rays, np.zeros(len(rays)), *_projection(self._pair))
+        along = directions.sum(axis=0)
+        across = np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9)
+        enough = found[1].sum() + max(_MIN_MORE, _MIN_SHARE_MORE * len(rays))
+        for distance_px in _SHIFTS_PX:
+            shift_px = distance_px * across
+            shifted = self._found_along(shift_px, left, right, pixels, rays, bounds)
+            if shifted[1].sum() >= enough:
+                found, enough, self._shift_px = shifted, shifted[1].sum() + 1, shift_px
+        return found
+
+    def _found_along(
+        self, shift_px: Float, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, bounds: Float
+    ) -> tuple[Float, Bool]:
+        """Search along lines that are shifted by (2,) pixels."""
+        right_T_left, model, intrinsics, distortion = _projection(self._pair)
+        shifted = intrinsics + np.concatenate([np.zeros(2), shift_px])
+        return epipolar_search(
+            left[:2], right[:2], pixels, rays, bounds, right_T_left, model, shifted, distortion, _SEARCH_CORRELATION
+        )
+
+
+def _projection(pair: TwoCameras) -> tuple[Float, int, Float, Float]:
+    """Return what projects points of the left camera into the right image."""
+    return pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion

@@ -106,7 +106,8 @@ class PairsCalibration:
         calibration, estimator = self._calibration, self._estimator
         if self._allowance is not None:
             self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, calibration.widest)
-        if status not in (Status.TRACKING, Status.INITIALISING) or quality is Quality.FAILED:
+        is_usable = status in (Status.TRACKING, Status.INITIALISING) and quality is not Quality.FAILED
+        if calibration.is_adjusted and not is_usable:
             return
         if estimator.epoch != self._epoch:
             self._epoch = estimator.epoch

@@ -107,6 +107,7 @@ class SelfCalibration:
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.extrinsics: dict[int, Float] = {}
         self.widest = widest
+        self.is_adjusted = False
         self.has_full_window = False
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
@@ -157,6 +158,10 @@ class SelfCalibration:
                 return
         self._agreeing += not are_contradicting
         self._collector.add(stamp_ns, odom_T_body, views)
+        if not self.is_adjusted:
+            # Left and right images of one instant show how epipolar lines are off, and motions may need it at once.
+            self._adjust_when_due()
+            self._due_in = 0
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
         """Return the covariance (6, 6) that errors of the calibration add to the newest pose (4, 4)."""
@@ -212,6 +217,7 @@ class SelfCalibration:
         ):
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
+        self.is_adjusted = True
         self._consider.extend(adjusted.window, adjusted.by_cameras)
         self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
         self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest

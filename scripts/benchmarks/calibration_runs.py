@@ -143,7 +143,7 @@ def _pose_nees(estimates: Sequence[Estimate], truth: Trajectory) -> float:
     """Compute the mean NEES of the poses since the first one, which defines nav, for each dimension."""
     true = dict(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True))
     first, *others = [e for e in estimates if e.stamp_ns in true][::_FRAMESETS_OF_NEES]
-    if others[-1].epoch != first.epoch:
+    if not others or others[-1].epoch != first.epoch:
         return np.nan
     assert first.nav_T_body is not None
     nav_T_world, nees = first.nav_T_body @ se3_inverse(true[first.stamp_ns]), []

@@ -1,0 +1,42 @@
+"""A rig file that is far off at the first images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphvio import Config, Odometry, open_source
+from graphvio.measurements.events import EventKind
+from graphvio.rig import Rig
+from graphvio.trajectory_files import load_trajectory
+
+
+def with_lower_right_images(rig: Rig, rows_px: float) -> Rig:
+    """Return a rig of the front pair alone, whose file has all of the right image some rows too low."""
+    pair = rig.pairs[0]
+    right = replace(pair.right, intrinsics=pair.right.intrinsics + np.array([0.0, 0.0, 0.0, rows_px]))
+    return replace(rig, pairs=(replace(pair, right=right),))
+
+
+@pytest.mark.parametrize("rows_px", [-6.0, 4.0])
+def test_first_images_correct_epipolar_lines_that_are_rows_off(room_walk: Path, rows_px: float) -> None:
+    rig = with_lower_right_images(open_source(room_walk).rig, rows_px)
+    source = open_source(room_walk, rig, to_s=3.0)
+    assert source.truth is not None
+    truth = load_trajectory(source.truth)
+    odometry = Odometry(rig, Config())
+    estimates = [estimate for estimate in map(odometry.process, source) if estimate is not None]
+    estimates += odometry.finish()
+    failed = [event for event in odometry.take_events() if event.kind in (EventKind.VISION_FAILED, EventKind.LOST)]
+    assert not failed
+    assert odometry.calibration is not None
+    assert not odometry.calibration.is_file_exact
+    moved = [pose[:3, 3] for pose in truth.nav_T_body]
+    true_m = {int(ns): float(np.linalg.norm(p - moved[0])) for ns, p in zip(truth.stamps_ns, moved, strict=True)}
+    last = estimates[-1]
+    assert last.nav_T_body is not None
+    assert true_m[last.stamp_ns] > 0.5
+    assert np.linalg.norm(last.nav_T_body[:3, 3]) == pytest.approx(true_m[last.stamp_ns], rel=0.01)
