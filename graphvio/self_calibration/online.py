@@ -284,11 +284,12 @@ class SelfCalibration:
             self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
-        prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
+        assumed = _assumed(self.estimate.file_factors)
+        prior = self._evidence.given(self._prior, assumed)
         samples, difference = self._collector.samples_of(window), self.estimate.posterior.mean
         if is_full:
             self.on_full_window(FullWindow(window, samples, self._sigma_px))
-        self._pending = self._worker.submit(self._adjust, window, samples, difference, prior, is_full)
+        self._pending = self._worker.submit(self._adjust, window, samples, difference, prior, assumed, is_full)
 
     def _adjust(
         self,
@@ -296,14 +297,18 @@ class SelfCalibration:
         samples: InertialSamples | None,
         difference: Float,
         prior: Gaussian,
+        assumed: Float,
         is_full: bool,
     ) -> _Adjusted:
         """Adjust a window; what is read here does not change while an adjustment is pending."""
         await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
-        evidence = self._evidence.with_window(prior, solution.calibration)
-        likelihood = FactorLikelihood(evidence, self._prior)
-        factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
+        evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
+        if not np.array_equal(_assumed(factors), assumed):
+            # What the window says was linearised where another file led it.
+            prior = self._evidence.given(self._prior, _assumed(factors))
+            solution = adjusted(window, samples, self._nominal, solution.calibration.mean, prior, self._sigma_px)
+            evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
         posterior = evidence.given(self._prior, _assumed(factors))
         n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
         is_changed = self._prior.change is not None
@@ -329,6 +334,12 @@ class SelfCalibration:
             window,
             is_full,
         )
+
+    def _judged(self, prior: Gaussian, solution: Solution) -> tuple[Evidence, FactorLikelihood, Float, float]:
+        """Return what a window and those before say, its likelihood, the file's factors, and their Bayes factor."""
+        evidence = self._evidence.with_window(prior, solution.calibration)
+        likelihood = FactorLikelihood(evidence, self._prior)
+        return evidence, likelihood, *evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
 
 
 def adjust_nothing(rig: Rig) -> None:
