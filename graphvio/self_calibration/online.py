@@ -88,6 +88,7 @@ class SelfCalibration:
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         widest: (C, C) covariance of what is known, if the file may be as wrong as any.
+        is_adjusted: whether it is based on a window, full or not.
         has_full_window: whether it is based on a full window at least.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
