@@ -85,6 +85,11 @@ class StereoMatcher:
         self._margin_px = epipolar_margin_px
         self._shift_px = np.zeros(2)
 
+    @property
+    def are_lines_off(self) -> bool:
+        """Whether corners are found beside the epipolar lines of the calibration."""
+        return bool(self._shift_px.any())
+
     def match(
         self,
         left: Pyramid,

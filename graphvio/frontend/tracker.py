@@ -161,6 +161,11 @@ class PairTracker:
         """The newest left image, and what is tracked in it."""
         return View(self._last, self._left, self._allowed, self._min_gradient)
 
+    @property
+    def are_lines_off(self) -> bool:
+        """Whether corners are found beside the epipolar lines of the calibration."""
+        return self._matcher is not None and self._matcher.are_lines_off
+
     def move(self, body_T_left: Float) -> None:
         """Take another pose (4, 4) of a single camera from now on."""
         self._body_T_left = np.ascontiguousarray(body_T_left)

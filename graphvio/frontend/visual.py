@@ -122,6 +122,11 @@ class VisualFrontend:
         """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
         return self._places.misaligned
 
+    @property
+    def are_lines_off(self) -> bool:
+        """Whether some pair's corners are found beside the epipolar lines of the calibration."""
+        return any(tracker.are_lines_off for tracker in self._trackers)
+
     def frames_at(self, stamp_ns: int) -> dict[int, PairFrame]:
         """Return the tracks of pairs and single cameras at the newest frameset, if it has this stamp."""
         return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
@@ -209,7 +214,8 @@ class VisualFrontend:
         """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
         self._all_frozen = frozen.all_since_ns is not None
-        for j in [j for j, frame in self._latest.items() if self._is_outdated(frame, frameset.stamp_ns)]:
+        oldest_ns = frameset.stamp_ns - THRESHOLDS.reference.max_absence_ns
+        for j in [j for j, frame in self._latest.items() if frame.stamp_ns < oldest_ns]:
             self._trackers[j].drop(self._latest.pop(j).ids)
             self._references.forget(j)
 
@@ -304,9 +310,6 @@ class VisualFrontend:
         return self._refer_to(seen.frames), own
 
     # ------------------------------------------------------------------ parts of these steps
-
-    def _is_outdated(self, frame: PairFrame, now_ns: int) -> bool:
-        return now_ns - frame.stamp_ns > THRESHOLDS.reference.max_absence_ns
 
     def _is_in_doubt(self, now_ns: int) -> bool:
         """Whether the pairs contradicted each other a moment ago."""

@@ -106,14 +106,16 @@ class PairsCalibration:
         calibration, estimator = self._calibration, self._estimator
         if self._allowance is not None:
             self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, calibration.widest)
+        is_urgent = self._frontend.are_lines_off
         is_usable = status in (Status.TRACKING, Status.INITIALISING) and quality is not Quality.FAILED
-        if calibration.is_adjusted and not is_usable:
+        if not (is_usable or is_urgent):
             return
         if estimator.epoch != self._epoch:
             self._epoch = estimator.epoch
             calibration.start_window()
         views = views_at(self._frontend, stamp_ns)
-        calibration.add_frameset(stamp_ns, estimator.state().nav_T_body, views, quality is Quality.WEAK)
+        pose = estimator.state().nav_T_body
+        calibration.add_frameset(stamp_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:
         """Give cameras to the front-end, and the IMU's scale, axes and time offset to the synchroniser."""

@@ -88,7 +88,6 @@ class SelfCalibration:
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         widest: (C, C) covariance of what is known, if the file may be as wrong as any.
-        is_adjusted: whether it is based on a window, full or not.
         has_full_window: whether it is based on a full window at least.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
@@ -108,7 +107,6 @@ class SelfCalibration:
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.extrinsics: dict[int, Float] = {}
         self.widest = widest
-        self.is_adjusted = False
         self.has_full_window = False
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
@@ -138,7 +136,12 @@ class SelfCalibration:
         self._collector.add_sample(sample)
 
     def add_frameset(
-        self, stamp_ns: int, odom_T_body: Float, views: Mapping[int, View], are_contradicting: bool = False
+        self,
+        stamp_ns: int,
+        odom_T_body: Float,
+        views: Mapping[int, View],
+        are_contradicting: bool = False,
+        is_urgent: bool = False,
     ) -> None:
         """Take what the pairs see at a frameset.
 
@@ -148,6 +151,8 @@ class SelfCalibration:
             views: index of the pair or single camera -> tracks.
             are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
                 did, and the scene if they once agreed.
+            is_urgent: whether motions cannot be measured with the calibration in force: an adjustment that is due comes
+                into force with this frameset then. Its left and right images alone show how epipolar lines are off.
         """
         self._adjust_when_due()
         if not self._collector.is_keyframe(stamp_ns, views, self._pace.interval_s):
@@ -159,8 +164,7 @@ class SelfCalibration:
                 return
         self._agreeing += not are_contradicting
         self._collector.add(stamp_ns, odom_T_body, views)
-        if not self.is_adjusted:
-            # Left and right images of one instant show how epipolar lines are off, and motions may need it at once.
+        if is_urgent:
             self._adjust_when_due()
             self._due_in = 0
 
@@ -218,7 +222,6 @@ class SelfCalibration:
         ):
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
-        self.is_adjusted = True
         self._consider.extend(adjusted.window, adjusted.by_cameras)
         self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
         self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
