@@ -20,7 +20,7 @@ _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `Ste
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
-_MIN_FOUND = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
+_MIN_FOUND = 0.25  # share of the new corners, below which epipolar lines beside those of the calibration are tried
 _SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
 _MIN_MORE, _MIN_SHARE_MORE = 10, 0.2  # new corners that they must find beyond the others
 
