@@ -20,9 +20,9 @@ _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `Ste
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
-_MIN_FOUND = 0.25  # share of the new corners, below which epipolar lines beside those of the calibration are tried
+_MIN_FOUND = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
 _SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
-_MIN_MORE, _MIN_SHARE_MORE = 10, 0.2  # new corners that they must find beyond the others
+_MIN_MORE, _MIN_RATIO = 10, 2.0  # new corners that they must find beyond the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,7 @@ class StereoMatcher:
         _, directions, _ = epipolar_lines(rays, np.zeros(len(rays)), *_projection(self._pair))
         along = directions.sum(axis=0)
         across = np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9)
-        enough = found[1].sum() + max(_MIN_MORE, _MIN_SHARE_MORE * len(rays))
+        enough = max(found[1].sum() + _MIN_MORE, _MIN_RATIO * found[1].sum())
         for distance_px in _SHIFTS_PX:
             shift_px = distance_px * across
             shifted = self._found_along(shift_px, left, right, pixels, rays, bounds)
