@@ -109,7 +109,7 @@ def search(left: Image, right: Image, pixels: Float, nearest_m: float = 0.5) -> 
     least = StereoConfig().min_correlation
     images = build_pyramid(left, 2), build_pyramid(right, 2)
     camera = (RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens)
-    inverse_depths, found = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, least)
+    inverse_depths, found, _ = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, least)
     return epipolar_lines(rays, inverse_depths, *camera)[0], found
 
 
@@ -161,7 +161,7 @@ def test_epipolar_search_follows_the_curve_of_a_distorted_lens() -> None:
     bounds = np.column_stack([np.zeros(len(rays)), np.full(len(rays), 2.0)])
     images = build_pyramid(left, 2), build_pyramid(right, 2)
     camera = (SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens)
-    inverse_depths, found = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, 0.7)
+    inverse_depths, found, _ = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, 0.7)
     matches = epipolar_lines(rays, inverse_depths, *camera)[0]
     assert inside.sum() >= 10
     assert found[inside].mean() > 0.8
@@ -186,7 +186,7 @@ def test_epipolar_search_covers_the_part_of_a_curve_within_the_lens() -> None:
             right[v - 11 : v + 12, u - 11 : u + 12] = left[y - 11 : y + 12, x - 11 : x + 12]
     bounds = np.column_stack([np.zeros(len(rays)), np.full(len(rays), 8.0)])
     images = build_pyramid(left, 2), build_pyramid(right, 2)
-    inverse_depths, found = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, 0.7)
+    inverse_depths, found, _ = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, 0.7)
     assert (found & cut).sum() >= 3
     seen = epipolar_lines(rays, inverse_depths, *camera)[0]
     assert np.median(np.abs(seen - places)[found & cut]) < 1.5

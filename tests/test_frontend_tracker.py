@@ -286,10 +286,22 @@ def test_match_margin_finds_matches_beside_wrong_epipolar_lines(lower_px: float)
     strict = tracker.observe(0, *images, None, None)
     tracker.recalibrate(replace(pair, right=lower), 3.0)
     wide = tracker.observe(1, *images, None, None)
+    assert tracker.are_lines_off == (abs(lower_px) > 3.0)
     assert strict.has_depth.mean() < 0.1
     assert wide.has_depth.mean() > 0.7 * exact.has_depth.mean()
     off_px = wide.pixels - np.array([DISPARITY, 0.0]) - wide.right_pixels
     assert np.median(np.abs(off_px[wide.has_depth])) < 0.1
+
+
+def test_match_margin_of_a_repeating_texture_leaves_the_epipolar_lines_where_they_are() -> None:
+    """Another row of the pattern is as like, and at times less ambiguous."""
+    rng, squares = np.random.default_rng(4), np.where((X // 12 + Y // 12) % 2, 60.0, 190.0)
+    noisy = (squares + rng.normal(0.0, 4.0, X.shape) for _ in range(2))
+    left, right = (np.clip(image, 0, 255).astype(np.uint8) for image in noisy)
+    tracker = PairTracker(rectified(), Config())
+    tracker.recalibrate(rectified(), 3.0)
+    tracker.observe(0, left, right, None, None)
+    assert not tracker.are_lines_off
 
 
 # ------------------------------------------------------------------ low light

@@ -20,9 +20,9 @@ _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `Ste
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
-_MIN_FOUND = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
+_MIN_ALIKE = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
 _SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
-_MIN_MORE, _MIN_RATIO = 10, 2.0  # new corners that they must find beyond the others
+_MIN_MORE, _MIN_RATIO = 10, 2.0  # new corners that something looks like there, beyond the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,27 +182,28 @@ class StereoMatcher:
     ) -> tuple[Float, Bool]:
         """Search corners (N,) along their epipolar lines: inverse depths (N,), and whether they were found (N,).
 
-        Where the calibration may be wrong and few corners are found, lines that are shifted are tried, and those by
-        which clearly more are found are kept: until the next calibration.
+        Where the calibration may be wrong and few lines have anything that looks like the corner, lines that are
+        shifted are tried, and those that have clearly more are kept: until the next calibration.
         """
-        found = self._found_along(self._shift_px, left, right, pixels, rays, bounds)
-        if not self._margin_px or found[1].mean() >= _MIN_FOUND:
-            return found
+        depths, found, alike = self._found_along(self._shift_px, left, right, pixels, rays, bounds)
+        if not self._margin_px or alike.mean() >= _MIN_ALIKE:
+            return depths, found
         _, directions, _ = epipolar_lines(rays, np.zeros(len(rays)), *_projection(self._pair))
         along = directions.sum(axis=0)
         across = np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9)
-        enough = max(found[1].sum() + _MIN_MORE, _MIN_RATIO * found[1].sum())
+        enough = max(alike.sum() + _MIN_MORE, _MIN_RATIO * alike.sum())
         for distance_px in _SHIFTS_PX:
             shift_px = distance_px * across
             shifted = self._found_along(shift_px, left, right, pixels, rays, bounds)
-            if shifted[1].sum() >= enough:
-                found, enough, self._shift_px = shifted, shifted[1].sum() + 1, shift_px
-        return found
+            if shifted[2].sum() >= enough:
+                (depths, found, alike), self._shift_px = shifted, shift_px
+                enough = alike.sum() + 1
+        return depths, found
 
     def _found_along(
         self, shift_px: Float, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, bounds: Float
-    ) -> tuple[Float, Bool]:
-        """Search along lines that are shifted by (2,) pixels."""
+    ) -> tuple[Float, Bool, Bool]:
+        """Search along lines that are shifted by (2,) pixels, see `epipolar_search`."""
         right_T_left, model, intrinsics, distortion = _projection(self._pair)
         shifted = intrinsics + np.concatenate([np.zeros(2), shift_px])
         return epipolar_search(

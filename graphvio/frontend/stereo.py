@@ -37,7 +37,7 @@ def epipolar_search(
     intrinsics: Float,
     distortion: Float,
     min_correlation: float,
-) -> tuple[Float, Bool]:
+) -> tuple[Float, Bool, Bool]:
     """Search the right image for each corner along its epipolar curve, to the pixel.
 
     The curve is searched in images of half the size; the whole image then decides around the best place there.
@@ -56,11 +56,11 @@ def epipolar_search(
         min_correlation: smallest normalised cross-correlation.
 
     Returns:
-        Inverse depths (N,), 1/m, and whether there is one clear best place (N,).
+        Inverse depths (N,), 1/m, whether there is one clear best place (N,), and whether any place looks like it (N,).
     """
     n = len(pixels)
     depths = np.zeros(n)
-    found = np.zeros(n, dtype=np.bool_)
+    found, alike = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     coarse, fine = empty_patch(HALF_COARSE_PATCH), empty_patch(HALF_PATCH)
     scores = np.empty(_MAX_STEPS + 1)
     camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
@@ -70,15 +70,16 @@ def epipolar_search(
             continue
         w1 = nearest_in_reach(rays[i], w0, w1, camera)
         best, steps = scan_curve(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
-        if steps == 0 or scores[best] < min_correlation or is_ambiguous(scores[: steps + 1], best):
+        if steps == 0 or scores[best] < min_correlation:
             continue
+        is_clear = not is_ambiguous(scores[: steps + 1], best)
         step = (w1 - w0) / steps
         w0, w1 = w0 + (best - FINE_STEPS) * step, w0 + (best + FINE_STEPS) * step
         best, steps = scan_curve(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
         if steps == 0 or scores[best] < min_correlation:
             continue
-        depths[i], found[i] = w0 + (w1 - w0) * best / steps, True
-    return depths, found
+        depths[i], found[i], alike[i] = w0 + (w1 - w0) * best / steps, is_clear, True
+    return depths, found, alike
 
 
 @kernel
