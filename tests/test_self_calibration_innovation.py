@@ -83,26 +83,3 @@ def test_innovation_errors_of_the_time_offset_are_those_of_a_later_motion() -> N
 def test_innovation_errors_of_a_standstill_are_none() -> None:
     errors = InnovationErrors(0.01 * np.eye(IMU + PARAMETERS), default_rig())
     np.testing.assert_allclose(errors.covariance(np.eye(4), np.zeros(6), np.zeros(6)), 0.0, atol=1e-15)
-
-
-def test_innovation_errors_of_the_force_are_those_of_an_attitude_by_wrong_cameras_after_a_turn() -> None:
-    rng, sigma, nominal = np.random.default_rng(6), 0.01, default_rig()
-    errors = InnovationErrors(covariance_with(BODY, np.diag(np.repeat([sigma**2, 0.0], 3))), nominal)
-    first_R_now, force, dt = so3_exp(np.array([0.3, 1.2, -0.7])), np.array([1.0, 3.0, 9.2]), 0.2
-    found = np.zeros((SAMPLES, 6))
-    for row, place in zip(found, sigma * rng.normal(size=(SAMPLES, 3)), strict=True):
-        seen = so3_exp(place) @ first_R_now @ so3_exp(-place)  # how cameras in a wrong place see the turn
-        row[3:] = dt**2 * (seen.T @ first_R_now @ force - force)
-    assert_sampled(found, errors.of_force(first_R_now, force, dt))
-
-
-def test_innovation_errors_of_the_force_are_those_of_a_wrong_matrix_beside_the_bias_of_before() -> None:
-    rng, sigma = np.random.default_rng(7), 0.01
-    errors = InnovationErrors(covariance_with(IMU + ACCEL_MATRIX, sigma**2 * np.eye(9)), default_rig())
-    first_R_now, force, dt = so3_exp(np.array([0.3, 1.2, -0.7])), np.array([1.0, 3.0, 9.2]), 0.2
-    found = np.zeros((SAMPLES, 6))
-    for row, matrix in zip(found, sigma * rng.normal(size=(SAMPLES, 3, 3)), strict=True):
-        bias = matrix @ first_R_now @ force
-        row[3:] = dt**2 * (matrix @ force - bias)
-    assert_sampled(found, errors.of_force(first_R_now, force, dt))
-    assert not errors.of_force(np.eye(3), force, dt).any()

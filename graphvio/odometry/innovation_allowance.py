@@ -50,7 +50,6 @@ class InnovationAllowance:
         self._followed: _Measured | None = None  # that motion
         self._tested: _Measured | None = None  # the newest one
         self._tested_by: dict[frozenset[int], RelativeMotion] = {}  # the newest one of each set of pairs
-        self._first_R_nav: Float | None = None  # of body when the state began
         self._velocity: Float | None = None  # (6,) of body at the newest frameset
         self._velocities: dict[int, Float | None] = {}
         """The same one frameset before that and before those which motions are measured from."""
@@ -78,8 +77,6 @@ class InnovationAllowance:
         self._velocities = {ns: each for ns, each in self._velocities.items() if ns in kept}
         self._velocities[stamp_ns] = self._velocity
         self._velocity = _body_velocity(estimator)
-        if self._first_R_nav is None:
-            self._first_R_nav = estimator.state().nav_T_body[:3, :3].T
 
     def recalibrate(self, change: Float) -> bool:
         """Take note that motions are measured with another calibration from now on.
@@ -121,10 +118,6 @@ class InnovationAllowance:
             return motion
         now = self._velocity  # that of the state here would come from the IMU under test
         added = self._errors.covariance(se3_inverse(now_T_since), self._velocities.get(since_ns), now)
-        if self._first_R_nav is not None:
-            nav_R_body, duration_s = estimator.state().nav_T_body[:3, :3], (motion.stamp_ns - since_ns) * 1e-9
-            force = -nav_R_body.T @ estimator.state().gravity_nav
-            added = added + self._errors.of_force(self._first_R_nav @ nav_R_body, force, duration_s)
         followed = self._followed
         if motion.by_depth_errors is not None:
             by_depth_errors = motion.by_depth_errors

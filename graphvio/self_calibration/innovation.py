@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.geometry import se3_adjoint, se3_inverse, skew, so3_log
+from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
 from graphvio.self_calibration.parameters import about_origin, depths_of_pair, n_of_cameras, place_of
@@ -35,7 +35,6 @@ class InnovationErrors:
         by_depths = [depths_of_pair(rig, j) for j in range(len(rig.pairs))]
         self._of_depths = [rows @ covariance[:n, :n] @ rows.T for rows in by_depths]
         self._of_matrix = imu[GYRO_MATRIX:ACCEL_MATRIX, GYRO_MATRIX:ACCEL_MATRIX].reshape(3, 3, 3, 3)
-        self._of_accel_matrix = imu[ACCEL_MATRIX:TIME_OFFSET, ACCEL_MATRIX:TIME_OFFSET].reshape(3, 3, 3, 3)
         self._of_time_offset = float(imu[TIME_OFFSET, TIME_OFFSET])
 
     def covariance(self, motion: Float, before: Float | None, now: Float | None) -> Float:
@@ -59,28 +58,6 @@ class InnovationErrors:
             by_time = now - carried @ before
             covariance += self._of_time_offset * np.outer(by_time, by_time)
         return np.asarray(covariance)
-
-    def of_force(self, first_R_now: Float, force: Float, duration_s: float) -> Float:
-        """Return the covariance that a wrong specific force adds, by what it has changed since the state began.
-
-        The state's biases and direction of gravity have what errors do that stay the same. Where body turns, the error
-        of the cameras' place tilts it against gravity, and that of the accelerometer's matrix is another one.
-
-        Args:
-            first_R_now: (3, 3) how body has turned since the state began.
-            force: (3,) specific force in body now, m/s^2.
-            duration_s: over which the state has followed the IMU alone.
-
-        Returns:
-            (6, 6), tangent ``[rotation, translation]`` in the body frame now.
-        """
-        tilt = skew(force) @ (first_R_now.T - np.eye(3))
-        change = force - first_R_now @ force
-        acceleration = tilt @ self._of_place[:3, :3] @ tilt.T
-        acceleration = acceleration + np.einsum("iajb,a,b->ij", self._of_accel_matrix, change, change)
-        covariance = np.zeros((6, 6))
-        covariance[3:, 3:] = duration_s**4 * acceleration  # the velocity is wrong by as much from the step before
-        return covariance
 
     def of_depths(self, derivatives: Float) -> Float:
         """Return the covariance that errors within the pairs add.
