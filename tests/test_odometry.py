@@ -25,6 +25,7 @@ from graphvio import (
 from graphvio.arrays import Image
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import Window, WindowError
+from graphvio.geometry import so3_log
 from graphvio.measurements.motion import Quality
 from graphvio.measurements.sensors import Measurement
 from graphvio.trajectory import Trajectory
@@ -398,6 +399,9 @@ def test_a_wild_imu_sample_leaves_an_error_that_the_covariance_admits(
     assert last.nav_T_body is not None
     assert last.covariance is not None
     true, _ = truth.at(np.array([first.stamp_ns, last.stamp_ns]), 0.1)
+    true_turn = true.nav_T_body[0, :3, :3].T @ true.nav_T_body[1, :3, :3]
+    off_rad = np.linalg.norm(so3_log(true_turn.T @ first.nav_T_body[:3, :3].T @ last.nav_T_body[:3, :3]))
+    assert off_rad < 3.0 * np.sqrt(np.linalg.eigvalsh(last.covariance[:3, :3])[-1])
     walked = np.linalg.norm(true.positions[1] - true.positions[0])
     error = abs(np.linalg.norm(last.nav_T_body[:3, 3] - first.nav_T_body[:3, 3]) - walked)
     assert error < 0.05

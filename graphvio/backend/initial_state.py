@@ -144,6 +144,27 @@ def from_vision(
     return _reinitialised(motion.stamp_ns, state, covariance, gravity_covariance, gyro_bias_sigma)
 
 
+def from_prediction(
+    motion: RelativeMotion,
+    nav_T_body: Float,
+    state: RigState,
+    pose_covariance: Float,
+    gravity_covariance: Float | None,
+) -> InitialState:
+    """Reinitialise at the predicted pose, uncertain by as much as a chain of refused motions leads elsewhere.
+
+    Args:
+        motion: The last motion of the chain, which agrees with the prediction.
+        nav_T_body: (4, 4) pose at the chain's end.
+        state: The prediction for the same instant.
+        pose_covariance: (6, 6) of the pose at the beginning of the chain, tangent in body.
+        gravity_covariance: (3, 3) of gravity in nav, or None where it is not estimated.
+    """
+    apart = se3_log(se3_inverse(state.nav_T_body) @ nav_T_body)
+    covariance = pose_covariance + motion.covariance + np.diag(apart**2)
+    return _reinitialised(motion.stamp_ns, _with_velocity(state, motion), covariance, gravity_covariance)
+
+
 def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covariance: StateCovariance) -> InitialState:
     """Reinitialise at the present pose for an IMU that was not used until now.
 

@@ -16,6 +16,7 @@ from graphvio.backend.initial_state import (
     after_gap,
     after_lost,
     first_state_at,
+    from_prediction,
     from_vision,
     with_free_gravity,
     with_new_imu,
@@ -235,10 +236,13 @@ class SmootherEstimator:
         self.gate_results["vision"] = gate_result
         excess = smoother.excess_acceleration(motion)
         if gate_result.accepted and excess is None:
-            if self._imu_failed and motion.reference_stamp_ns in self._refused:
+            if motion.reference_stamp_ns in self._refused:
                 # It agrees with the prediction only because both start from a state that vision did not constrain.
                 self._refused[motion.stamp_ns] = self._refused[motion.reference_stamp_ns] @ motion.reference_T_current
-                self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
+                if self._imu_failed:
+                    self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
+                else:
+                    self._reinitialise_from_prediction(motion)
                 return MeasurementUpdate(motion, needs_keyframe=True)
             smoother.add_motion(motion)
             self._accepted += 1
@@ -332,6 +336,23 @@ class SmootherEstimator:
             motion.stamp_ns,
             EventKind.GATE_RESET,
             f"{why}: the state is reinitialised from vision, {apart_m:.3f} m from the prediction",
+        )
+
+    def _reinitialise_from_prediction(self, motion: RelativeMotion) -> None:
+        """Go on from the prediction where motions that were refused are followed by one that agrees with it.
+
+        Whether vision was wrong until then, or the IMU, is not known: the pose is uncertain by their difference.
+        """
+        smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
+        predicted = smoother.state()
+        initial = from_prediction(motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity)
+        self._reinitialise(initial, self._tracked_ns)
+        apart = se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)
+        self._report(
+            motion.stamp_ns,
+            EventKind.GATE_RESET,
+            f"vision was refused, and agrees again: the state is reinitialised at the prediction, which is "
+            f"{np.linalg.norm(apart[3:]):.3f} m and {np.rad2deg(np.linalg.norm(apart[:3])):.2f} deg elsewhere",
         )
 
     def _reinitialise(self, initial: InitialState, last_final_ns: int) -> None:
