@@ -71,7 +71,9 @@ class EventKind(StrEnum):
     MOTION_OVER_SEVERAL_STEPS = "motion_over_several_steps"
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
-    """Vision was gated for too long; the smoother is reinitialised from vision, the filter's velocities are reset."""
+    """Vision was gated for too long; the smoother is reinitialised from vision, the filter's velocities are reset.
+    Or the frameset that motions are measured from was gated, and the next motion passes: the smoother goes on from the
+    prediction, uncertain by what vision said."""
     SCALE_KNOWN = "scale_known"
     """A rig of single cameras has moved so that the scale is known; poses are estimated from now on."""
     LOST = "lost"
