@@ -176,15 +176,12 @@ def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float
         return basis
     first, scale = 0, 1.0
     if model >= DOUBLE_SPHERE:
-        by_xi, by_alpha, by_beta = _sphere_derivatives(model, distortion, x, y)
-        if model == DOUBLE_SPHERE:
-            basis[0, 0], basis[0, 1], basis[1, 0], basis[1, 1] = x * by_xi, y * by_xi, x * by_alpha, y * by_alpha
+        on_plane, by_xi, by_alpha, by_beta = _sphere_derivatives(model, distortion, x, y)
+        if model != OMNIDIRECTIONAL:
+            one, other = (by_xi, by_alpha) if model == DOUBLE_SPHERE else (by_alpha, by_beta)
+            basis[0, 0], basis[0, 1], basis[1, 0], basis[1, 1] = x * one, y * one, x * other, y * other
             return basis
-        if model == EXTENDED_UNIFIED:
-            basis[0, 0], basis[0, 1], basis[1, 0], basis[1, 1] = x * by_alpha, y * by_alpha, x * by_beta, y * by_beta
-            return basis
-        first, (on_plane, _) = 1, _sphere(model, distortion, x, y)
-        u, v = x * on_plane, y * on_plane
+        first, u, v = 1, x * on_plane, y * on_plane
         _, _, a, b, c, d = _polynomial(model, distortion, u, v)
         basis[0, 0], basis[0, 1] = (a * x + b * y) * by_xi, (c * x + d * y) * by_xi
         x, y = u, v
@@ -201,11 +198,11 @@ def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float
 
 
 @kernel
-def _sphere_derivatives(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float]:
-    """Compute the derivatives of `_sphere`'s scale by xi, alpha and beta; 0 outside the model's domain."""
+def _sphere_derivatives(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float, float]:
+    """Compute `_sphere`'s scale and its derivatives by xi, alpha and beta; 0 outside the model's domain."""
     scale, _ = _sphere(model, distortion, x, y)
     if not scale > 0.0:
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     xi, alpha, beta = _sphere_shape(model, distortion)
     r2 = x * x + y * y
     d1 = np.sqrt(1.0 + r2)
@@ -213,7 +210,7 @@ def _sphere_derivatives(model: int, distortion: Float, x: float, y: float) -> tu
     d2 = np.sqrt(beta * r2 + z * z)
     by_denominator = -scale * scale
     by_xi, by_alpha, by_beta = (alpha * z / d2 + 1.0 - alpha) * d1, d2 - z, 0.5 * alpha * r2 / d2
-    return by_denominator * by_xi, by_denominator * by_alpha, by_denominator * by_beta
+    return scale, by_denominator * by_xi, by_denominator * by_alpha, by_denominator * by_beta
 
 
 @kernel

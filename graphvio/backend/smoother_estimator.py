@@ -351,7 +351,7 @@ class SmootherEstimator:
         self._report(
             motion.stamp_ns,
             EventKind.GATE_RESET,
-            f"vision was refused, and agrees again: the state is reinitialised at the prediction, which is "
+            "vision was refused, and agrees again: the state is reinitialised at the prediction, which is "
             f"{np.linalg.norm(apart[3:]):.3f} m and {np.rad2deg(np.linalg.norm(apart[:3])):.2f} deg elsewhere",
         )
 

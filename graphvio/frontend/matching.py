@@ -22,7 +22,7 @@ _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
 _MIN_ALIKE = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
 _SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
-_MIN_MORE, _MIN_RATIO = 10, 2.0  # new corners that something looks like there, beyond the others
+_MIN_MORE, _MIN_RATIO = 10, 2.0  # such corners that they must have beyond the others
 
 
 @dataclass(frozen=True, eq=False)
