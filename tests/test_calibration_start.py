@@ -9,9 +9,15 @@ import numpy as np
 import pytest
 
 from graphvio import Config, Odometry, open_source
+from graphvio.evaluation import evaluate
 from graphvio.measurements.events import EventKind
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
+from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
+
+CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 
 
 def with_lower_right_images(rig: Rig, rows_px: float) -> Rig:
@@ -40,3 +46,27 @@ def test_first_images_correct_epipolar_lines_that_are_rows_off(room_walk: Path, 
     assert last.nav_T_body is not None
     assert true_m[last.stamp_ns] > 0.5
     assert np.linalg.norm(last.nav_T_body[:3, 3]) == pytest.approx(true_m[last.stamp_ns], rel=0.01)
+
+
+@pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
+@pytest.mark.parametrize("draw_seed", [0, 5])
+def test_imu_of_another_clock_is_kept_from_a_start_in_motion(draw_seed: int) -> None:
+    """The time offset is 8 ms off, and vision is refused until that is known: the IMU is corrected, not left out."""
+    source = open_source(CLIP)
+    error = draw(source.rig, CalibrationError.of_level(3), draw_seed)
+    assert error.true_rig.imu is not None
+    rig = replace(error.written_rig, imu=error.true_rig.imu)  # the samples are as they are, and the rig is off
+    odometry, posed = Odometry(rig, Config()), []
+    for measurement in open_source(CLIP, rig, to_s=5.0):
+        if isinstance(measurement, ImuSample):
+            rate, force = measurement.angular_velocity, measurement.linear_acceleration
+            measurement = ImuSample(measurement.stamp_ns, error.imu.gyro_matrix @ rate, error.imu.accel_matrix @ force)
+        posed.append(odometry.process(measurement))
+    posed += odometry.finish()
+    kinds = {event.kind for event in odometry.take_events()}
+    assert not kinds & {EventKind.IMU_LEFT_OUT, EventKind.LOST, EventKind.VISION_FAILED}
+    stamps = [estimate.stamp_ns for estimate in posed if estimate is not None]
+    poses = [estimate.nav_T_body for estimate in posed if estimate is not None]
+    assert source.truth is not None
+    estimated = Trajectory(np.array(stamps), np.array(poses))
+    assert evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse < 0.01

@@ -61,6 +61,7 @@ class SmootherEstimator:
         self._accepted = 0  # motions since the initialisation
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._imu_failed = False  # since the first of these
+        self._is_distrusted = False  # since the first of these, the prediction is known to be wrong
         self._is_imu_left_out = False
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
         self._sigma_m = 0.0  # of the position since vision last constrained it
@@ -204,6 +205,13 @@ class SmootherEstimator:
         """Take note that the IMU is left out, until `use_imu_again`: nothing more of it will complete the state."""
         self._is_imu_left_out = True
 
+    def distrust_prediction(self) -> None:
+        """Take note that the IMU was corrected wrongly: motions that are being refused are right, and the state is not.
+
+        Unlike when they are refused for too long, biases and attitude have followed wrong samples, and are opened.
+        """
+        self._is_distrusted = bool(self._refused)
+
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
         """Reinitialise at the newest pose for an IMU that was left out, of which the state knows nothing that is right.
 
@@ -255,6 +263,9 @@ class SmootherEstimator:
         reference_ns = motion.reference_stamp_ns
         nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
         self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
+        if self._is_distrusted:
+            self._reinitialise_from_vision(motion, "the IMU was corrected wrongly while vision was refused")
+            return MeasurementUpdate(motion, needs_keyframe=True)
         if motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
             self._reinitialise_from_vision(motion, "refused for too long")
             return MeasurementUpdate(motion, needs_keyframe=True)
@@ -326,10 +337,12 @@ class SmootherEstimator:
         """
         smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
         predicted = smoother.state()
-        has_failed = self._imu_failed and not self._is_imu_left_out
+        has_failed = self._is_distrusted or (self._imu_failed and not self._is_imu_left_out)
         initial = from_vision(
             motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity, has_failed
         )
+        if self._is_distrusted:
+            initial = with_wide_attitude(initial)
         self._reinitialise(initial, self._tracked_ns)
         apart_m = np.linalg.norm(se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)[3:])
         self._report(
@@ -373,7 +386,7 @@ class SmootherEstimator:
     def _note_accepted(self) -> None:
         """Take note that vision is accepted: nothing is refused any more, and the estimate is not lost."""
         self._refused.clear()
-        self._imu_failed = False
+        self._imu_failed = self._is_distrusted = False
         self._status.is_lost = False
 
     @property

@@ -72,6 +72,7 @@ class EventKind(StrEnum):
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
     """Vision was gated for too long; the smoother is reinitialised from vision, the filter's velocities are reset.
+    Or the IMU's calibration turns out to be wrong while vision is gated: the smoother is reinitialised from vision.
     Or the frameset that motions are measured from was gated, and the next motion passes: the smoother goes on from the
     prediction, uncertain by what vision said."""
     SCALE_KNOWN = "scale_known"

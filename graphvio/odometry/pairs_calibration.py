@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import so3_log
@@ -29,6 +30,7 @@ from graphvio.self_calibration.parameters import n_of_cameras
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
 _MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
 _MAX_TURN_RAD = np.deg2rad(0.3)  # of the cameras in body, up to which motions are measured from references as before
+_DISTRUST_SIGMAS = 5.0  # by which the IMU's calibration changes: what was predicted by the one before is wrong
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
 
 
@@ -69,6 +71,7 @@ class PairsCalibration:
         self._allowance = None if rig.imu is None else InnovationAllowance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
         self._in_force = np.zeros(n_of_cameras(rig))  # difference of the cameras' calibration from the rig file
+        self._imu_in_force = np.zeros_like(self.estimate.difference[n_of_cameras(rig) :])
         self._margin_px = self._epipolar_margin_px()
         frontend.recalibrate(rig, self._margin_px)
 
@@ -107,7 +110,9 @@ class PairsCalibration:
         if self._allowance is not None:
             self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, calibration.widest)
         is_urgent = self._frontend.are_lines_off
-        is_usable = status in (Status.TRACKING, Status.INITIALISING) and quality is not Quality.FAILED
+        # Until the calibration is trusted, motions may be refused because of it.
+        is_refused = status is Status.COASTING and not calibration.is_trusted
+        is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
         if not (is_usable or is_urgent):
             return
         if estimator.epoch != self._epoch:
@@ -154,6 +159,12 @@ class PairsCalibration:
         """Let the synchroniser correct samples as the calibration in force has it."""
         if self._rig.imu is None:
             return
+        n = n_of_cameras(self._rig)
+        of_imu, sigmas = self.estimate.difference[n:], self.estimate.sigmas[n:]
+        was_wrong = bool((np.abs(of_imu - self._imu_in_force) > _DISTRUST_SIGMAS * sigmas).any())
+        self._imu_in_force = of_imu
+        if was_wrong and isinstance(self._estimator, SmootherEstimator):
+            self._estimator.distrust_prediction()
         self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + self.estimate.time_offset_s
