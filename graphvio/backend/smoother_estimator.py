@@ -205,6 +205,10 @@ class SmootherEstimator:
         """Take note that the IMU is left out, until `use_imu_again`: nothing more of it will complete the state."""
         self._is_imu_left_out = True
 
+    def pose_by_vision(self) -> Float:
+        """Return ``nav_T_body`` (4, 4) of the newest state, by motions where they have been refused until then."""
+        return self._refused.get(self.latest_ns, self.state().nav_T_body)
+
     def distrust_prediction(self) -> None:
         """Take note that the IMU was corrected wrongly: motions that are being refused are right, and the state is not.
 

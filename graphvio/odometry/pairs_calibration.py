@@ -59,6 +59,7 @@ class PairsCalibration:
         self._frontend = frontend
         self._synchroniser = synchroniser
         self._estimator = estimator
+        self._smoother = estimator if isinstance(estimator, SmootherEstimator) else None
         self._report = report
         self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
         self._mean_force: Float = np.zeros(3)  # of the first samples
@@ -119,7 +120,7 @@ class PairsCalibration:
             self._epoch = estimator.epoch
             calibration.start_window()
         views = views_at(self._frontend, stamp_ns)
-        pose = estimator.state().nav_T_body
+        pose = estimator.state().nav_T_body if self._smoother is None else self._smoother.pose_by_vision()
         calibration.add_frameset(stamp_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:
@@ -163,8 +164,8 @@ class PairsCalibration:
         of_imu, sigmas = self.estimate.difference[n:], self.estimate.sigmas[n:]
         was_wrong = bool((np.abs(of_imu - self._imu_in_force) > _DISTRUST_SIGMAS * sigmas).any())
         self._imu_in_force = of_imu
-        if was_wrong and isinstance(self._estimator, SmootherEstimator):
-            self._estimator.distrust_prediction()
+        if was_wrong and self._smoother is not None:
+            self._smoother.distrust_prediction()
         self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + self.estimate.time_offset_s
