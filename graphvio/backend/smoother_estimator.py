@@ -250,8 +250,8 @@ class SmootherEstimator:
         if gate_result.accepted and excess is None:
             if motion.reference_stamp_ns in self._refused:
                 # It agrees with the prediction only because both start from a state that vision did not constrain.
-                self._refused[motion.stamp_ns] = self._refused[motion.reference_stamp_ns] @ motion.reference_T_current
-                if self._imu_failed:
+                self._add_refused(motion)
+                if self._is_distrusted or self._imu_failed:
                     self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
                 else:
                     self._reinitialise_from_prediction(motion)
@@ -264,9 +264,7 @@ class SmootherEstimator:
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
         if visual.quality is not Quality.GOOD:
             return MeasurementUpdate(None)  # vision that contradicts itself cannot refute the prediction
-        reference_ns = motion.reference_stamp_ns
-        nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
-        self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
+        self._add_refused(motion)
         if self._is_distrusted:
             self._reinitialise_from_vision(motion, "the IMU was corrected wrongly while vision was refused")
             return MeasurementUpdate(motion, needs_keyframe=True)
@@ -274,6 +272,14 @@ class SmootherEstimator:
             self._reinitialise_from_vision(motion, "refused for too long")
             return MeasurementUpdate(motion, needs_keyframe=True)
         return MeasurementUpdate(None)
+
+    def _add_refused(self, motion: RelativeMotion) -> None:
+        """Take note of the pose that a motion leads to, from a state or from where motions before it led to."""
+        reference_ns = motion.reference_stamp_ns
+        nav_T_reference = self._refused.get(reference_ns)
+        if nav_T_reference is None:
+            nav_T_reference = self._running.pose(reference_ns)
+        self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
 
     def _gate(self, visual: VisualResult) -> tuple[RelativeMotion, GateResult]:
         """Return the motion and its gate result; of contradicting hypotheses, the one that the prediction prefers."""
@@ -336,8 +342,8 @@ class SmootherEstimator:
     def _reinitialise_from_vision(self, motion: RelativeMotion, why: str) -> None:
         """Take the pose from refused motions that go on agreeing with each other: the prediction is at fault.
 
-        Their chain begins at a state that was accepted. Unless the IMU is known to have failed at that moment, the pose
-        is uncertain by as much as it differs from the prediction.
+        Their chain begins at a state that was accepted. Unless the IMU is known to have failed at that moment, or was
+        corrected wrongly, the pose is uncertain by as much as it differs from the prediction.
         """
         smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
         predicted = smoother.state()

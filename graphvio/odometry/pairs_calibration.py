@@ -71,8 +71,7 @@ class PairsCalibration:
         self._calibration = SelfCalibration(rig)
         self._allowance = None if rig.imu is None else InnovationAllowance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
-        self._in_force = np.zeros(n_of_cameras(rig))  # difference of the cameras' calibration from the rig file
-        self._imu_in_force = np.zeros_like(self.estimate.difference[n_of_cameras(rig) :])
+        self._in_force = np.zeros_like(self.estimate.difference)  # of the calibration from the rig file
         self._margin_px = self._epipolar_margin_px()
         frontend.recalibrate(rig, self._margin_px)
 
@@ -137,10 +136,12 @@ class PairsCalibration:
         self._margin_px = margin_px
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(self.estimate.rig, margin_px, self._calibration.extrinsics)
-        cameras = self.estimate.difference[: n_of_cameras(self._rig)]
-        change, self._in_force = cameras - self._in_force, cameras
-        if self._allowance is not None and self._allowance.recalibrate(change):
+        change, n = self.estimate.difference - self._in_force, n_of_cameras(self._rig)
+        self._in_force = self.estimate.difference
+        if self._allowance is not None and self._allowance.recalibrate(change[:n]):
             self._frontend.start_keyframe()
+        if self._smoother is not None and (np.abs(change) > _DISTRUST_SIGMAS * self.estimate.sigmas)[n:].any():
+            self._smoother.distrust_prediction()
         self._correct_imu()
         return self._turn()
 
@@ -160,12 +161,6 @@ class PairsCalibration:
         """Let the synchroniser correct samples as the calibration in force has it."""
         if self._rig.imu is None:
             return
-        n = n_of_cameras(self._rig)
-        of_imu, sigmas = self.estimate.difference[n:], self.estimate.sigmas[n:]
-        was_wrong = bool((np.abs(of_imu - self._imu_in_force) > _DISTRUST_SIGMAS * sigmas).any())
-        self._imu_in_force = of_imu
-        if was_wrong and self._smoother is not None:
-            self._smoother.distrust_prediction()
         self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + self.estimate.time_offset_s
