@@ -20,9 +20,11 @@ _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `Ste
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
-_MIN_ALIKE = 0.5  # share of the new corners, below which epipolar lines beside those of the calibration are tried
+_MIN_ALIKE = 0.75  # share of the new corners, below which epipolar lines beside those of the calibration are tried
 _SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
-_MIN_MORE, _MIN_RATIO = 10, 2.0  # such corners that they must have beyond the others
+# Corners that look alike by chance are as many on any line, often half of them; how many more the shifted lines need,
+# absolutely, over the scatter of such a count, and over what those of the calibration have more.
+_MIN_MORE, _MIN_SIGMAS, _MIN_RATIO = 10, 5.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +184,7 @@ class StereoMatcher:
     ) -> tuple[Float, Bool]:
         """Search corners (N,) along their epipolar lines: inverse depths (N,), and whether they were found (N,).
 
-        Where the calibration may be wrong and few lines have anything that looks like the corner, lines that are
+        Where the calibration may be wrong and many lines have nothing that looks like the corner, lines that are
         shifted are tried, and those that have clearly more are kept: until the next calibration.
         """
         depths, found, alike = self._found_along(self._shift_px, left, right, pixels, rays, bounds)
@@ -191,13 +193,17 @@ class StereoMatcher:
         _, directions, _ = epipolar_lines(rays, np.zeros(len(rays)), *_projection(self._pair))
         along = directions.sum(axis=0)
         across = np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9)
-        enough = max(alike.sum() + _MIN_MORE, _MIN_RATIO * alike.sum())
+        tried = [(self._shift_px, (depths, found, alike))]
         for distance_px in _SHIFTS_PX:
             shift_px = distance_px * across
-            shifted = self._found_along(shift_px, left, right, pixels, rays, bounds)
-            if shifted[2].sum() >= enough:
-                (depths, found, alike), self._shift_px = shifted, shift_px
-                enough = alike.sum() + 1
+            tried.append((shift_px, self._found_along(shift_px, left, right, pixels, rays, bounds)))
+        counts = np.array([each.sum() for _, (_, _, each) in tried])
+        by_chance = float(np.median(counts))
+        sigma = np.sqrt(by_chance * (1.0 - by_chance / len(pixels)))
+        best = int(np.argmax(counts))
+        here, there = counts[0] - by_chance, counts[best] - by_chance
+        if there >= max(_MIN_MORE, _MIN_SIGMAS * sigma) + _MIN_RATIO * max(here, 0.0):
+            self._shift_px, (depths, found, _) = tried[best]
         return depths, found
 
     def _found_along(
