@@ -19,7 +19,7 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import Measurement
-from graphvio.rig import Rig
+from graphvio.rig import Camera, Rig
 from graphvio.trajectory_files import load_trajectory
 
 Change = Callable[[float, FrameSet], FrameSet]
@@ -307,18 +307,33 @@ def test_exposure_that_jumps(vga_walk: Path, measurements: list[Measurement]) ->
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
 
 
+def _on_poster(camera: Camera, left_T_camera: Float) -> Float:
+    """Where (height, width, 2) on a plane 1 m before the left camera the pixels of a camera look, metres."""
+    width, height = camera.size_px
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
+    rays, _ = camera.unproject(pixels)
+    directions = np.column_stack([rays, np.ones(len(rays))]) @ left_T_camera[:3, :3].T
+    origin = left_T_camera[:3, 3]
+    distances = (1.0 - origin[2]) / directions[:, 2:]
+    on_plane = origin + distances * directions
+    return np.asarray(on_plane[:, :2].reshape(height, width, 2))
+
+
 def test_a_poster_that_is_carried_across_one_view(vga_walk: Path, measurements: list[Measurement]) -> None:
     """A textured plane, 1 m away, fills the first pair's view and moves: its motion is not the rig's."""
-    noise = np.random.default_rng(5).integers(0, 256, (480, 2000), dtype=np.uint8)
+    noise = np.random.default_rng(5).integers(0, 256, (800, 2000), dtype=np.uint8)
     poster = np.asarray(cv2.equalizeHist(cv2.GaussianBlur(noise, (0, 0), 3)), dtype=np.uint8)
     pair = open_source(vga_walk).rig.pairs[0]
-    disparity = round(pair.left.focal_px * pair.baseline_m / 1.0)
+    seen_at_m = [_on_poster(pair.left, np.eye(4)), _on_poster(pair.right, se3_inverse(pair.right_T_left))]
 
     def carry(seconds: float, frameset: FrameSet) -> FrameSet:
         if not 2.0 <= seconds < 4.0:
             return frameset
-        at = 300 + round(120 * (seconds - 2.0))  # pixels: 0.3 m/s
-        left, right = (np.ascontiguousarray(poster[:, at + shift : at + shift + 640]) for shift in (0, disparity))
+        centre_px = np.array([700.0 + 120.0 * (seconds - 2.0), 400.0])  # 0.3 m/s
+        maps = [(400.0 * at_m + centre_px).astype(np.float32) for at_m in seen_at_m]
+        left, right = (
+            np.asarray(cv2.remap(poster, each[..., 0], each[..., 1], cv2.INTER_LINEAR), dtype=np.uint8) for each in maps
+        )
         return replace(frameset, images={**frameset.images, 0: (left, right)})
 
     walk = Walk(vga_walk, measurements, carry)

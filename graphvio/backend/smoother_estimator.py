@@ -34,6 +34,9 @@ from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
+# Difference of the statistics of two hypotheses, 20 to 1, that decides without an IMU: constant velocity refuses hardly
+# any motion.
+_MIN_LIKELIER = 6.0
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
 
 
@@ -288,7 +291,11 @@ class SmootherEstimator:
         tested.sort(key=lambda each: each[0].statistic)
         if tested:
             (likely, motion), (unlikely, _) = tested[:2]
-            if likely.accepted and not unlikely.accepted and likely.is_clear and unlikely.is_clear:
+            if self.has_imu:
+                is_decided = not unlikely.accepted and likely.is_clear and unlikely.is_clear
+            else:
+                is_decided = unlikely.statistic - likely.statistic > _MIN_LIKELIER
+            if likely.accepted and is_decided:
                 return motion, likely
         return visual.motion, self._running.gate(visual.motion)
 
