@@ -7,6 +7,7 @@ from contextlib import suppress
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.contradiction import Contradiction
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
 from graphvio.backend.imu_match import ImuMatch
 from graphvio.backend.initial_state import (
@@ -34,9 +35,6 @@ from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
-# Difference of the statistics of two hypotheses, 20 to 1, that decides without an IMU: constant velocity refuses hardly
-# any motion.
-_MIN_LIKELIER = 6.0
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
 
 
@@ -59,6 +57,7 @@ class SmootherEstimator:
         self._report = report
         self._status = StatusMonitor(config.smoother.lost_position_sigma_m, report)
         self._smoother: Smoother | None = None
+        self._contradiction = Contradiction()
         self._reset_ns = 0
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._accepted = 0  # motions since the initialisation
@@ -247,7 +246,7 @@ class SmootherEstimator:
             # It is not from a state that was known.
             self._reinitialise_after_lost(motion)
             return MeasurementUpdate(motion, needs_keyframe=True)
-        motion, gate_result = self._gate(visual)
+        motion, gate_result = self._contradiction.resolve(visual, self._running.gate, self.has_imu)
         self.gate_results["vision"] = gate_result
         excess = smoother.excess_acceleration(motion)
         if gate_result.accepted and excess is None:
@@ -283,21 +282,6 @@ class SmootherEstimator:
         if nav_T_reference is None:
             nav_T_reference = self._running.pose(reference_ns)
         self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
-
-    def _gate(self, visual: VisualResult) -> tuple[RelativeMotion, GateResult]:
-        """Return the motion and its gate result; of contradicting hypotheses, the one that the prediction prefers."""
-        assert visual.motion is not None
-        tested = [(self._running.gate(motion), motion) for motion in visual.alternatives]
-        tested.sort(key=lambda each: each[0].statistic)
-        if tested:
-            (likely, motion), (unlikely, _) = tested[:2]
-            if self.has_imu:
-                is_decided = not unlikely.accepted and likely.is_clear and unlikely.is_clear
-            else:
-                is_decided = unlikely.statistic - likely.statistic > _MIN_LIKELIER
-            if likely.accepted and is_decided:
-                return motion, likely
-        return visual.motion, self._running.gate(visual.motion)
 
     def _apply_zero_velocity(self) -> None:
         gate_result = self._running.gate_zero_velocity()

@@ -285,7 +285,11 @@ class VisualFrontend:
         is_stationary = self._standstill.update(seen.frames, seen.correspondences.identities(seen.frames, inlier))
         for j, rows in seen.correspondences.rows.items():
             self._trackers[j].drop(seen.frames[j].ids[rows[~inliers_of(j, seen.correspondences, agreement)]])
-        alternatives = tuple(hypothesis.motion for hypothesis in hypotheses) if len(hypotheses) > 1 else ()
+        alternatives = tuple(
+            replace(graded_one.motion, pairs=hypothesis.pairs)
+            for graded_one, hypothesis in zip(hypotheses, agreement.hypotheses, strict=True)
+            if len(hypotheses) > 1
+        )
         return _Graded(motion, quality, reason, alternatives, is_stationary)
 
     @timed("replenish")

@@ -68,6 +68,7 @@ class RelativeMotion:
             them, same tangent; zero for pairs that did not measure it. None where errors of pairs are not estimated.
         calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
             where they add nothing. Innovation tests allow for it.
+        pairs: Of one of several hypotheses, indices of the pairs and single cameras whose motion it is.
     """
 
     reference_stamp_ns: int
@@ -78,6 +79,7 @@ class RelativeMotion:
     inliers: int
     by_depth_errors: Float | None = None
     calibration_covariance: Float | None = None
+    pairs: tuple[int, ...] = ()
 
     @property
     def duration_s(self) -> float:
