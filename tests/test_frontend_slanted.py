@@ -86,14 +86,22 @@ def test_align_slanted_accepts_initial_slopes() -> None:
     np.testing.assert_allclose(np.median(slopes[both], axis=0), slant, atol=0.01)
 
 
-@pytest.mark.parametrize(("gain", "offset", "within_px"), [(1.0, -20.0, 0.05), (0.9, -10.0, 0.2)])
-def test_align_slanted_under_a_change_of_exposure_hardly_moves(gain: float, offset: float, within_px: float) -> None:
-    left, right_image = views(0.1, 0.1)
-    darker = np.clip(np.round(gain * right_image + offset), 0, 255).astype(np.uint8)
+@pytest.mark.parametrize(
+    ("gain", "offset", "within_px"), [(1.0, -20.0, 0.05), (0.9, -10.0, 0.12), (0.5, 10.0, 0.06), (0.5, 120.0, 0.06)]
+)
+@pytest.mark.parametrize("is_brighter", [False, True])
+def test_align_slanted_under_a_change_of_exposure_hardly_moves(
+    gain: float, offset: float, within_px: float, is_brighter: bool
+) -> None:
+    """Contrast and brightness of one image differ from the other's, to either side; a little is taken for none."""
+    images = list(views(0.1, 0.1))
+    darker = 0 if is_brighter else 1
+    images[darker] = np.clip(np.round(gain * images[darker] + offset), 0, 255).astype(np.uint8)
     right = truth(grid(), 0.1, 0.1)
-    moved, _, correlations, found = aligned((left, darker), right)
+    moved, slopes, correlations, found = aligned((images[0], images[1]), right)
     assert found.mean() > 0.9
     assert np.median(np.linalg.norm(moved - right, axis=1)[found]) < within_px
+    np.testing.assert_allclose(np.median(slopes[found], axis=0), (0.1, 0.1), atol=0.03)
     assert np.median(correlations[found]) > 0.97
 
 

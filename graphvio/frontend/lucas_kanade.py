@@ -2,7 +2,7 @@
 
 Inverse compositional (S. Baker, I. Matthews, *Lucas-Kanade 20 years on*, IJCV 56(3), 2004): gradients and normal
 matrix belong to the patch and are computed once for all iterations. The patch's mean brightness is left out of the
-comparison, so that a change of exposure moves no point.
+comparison, and its contrast is estimated with the shift, so that a change of exposure moves no point.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def _forth_and_back(
             u, v = moved[i, 0] * scale, moved[i, 1] * scale
             if not sample(source[level], x, y, half + 1, bordered):
                 continue  # near the edge of a coarse level: the finer ones may still see it
-            xx, xy, yy = prepare(bordered, inside, patch, gx, gy)
-            u, v, converged = align(target[level], u, v, patch, gx, gy, xx, xy, yy, min_gradient)
+            normal = prepare(bordered, inside, patch, gx, gy)
+            u, v, converged = align(target[level], u, v, patch, gx, gy, normal, min_gradient)
             if converged or level > 0:
                 moved[i, 0], moved[i, 1] = u / scale, v / scale
             found[i] = converged and level == 0
@@ -111,11 +111,11 @@ def _forth_and_back(
             # The way back begins where it should end, so it needs no coarse levels.
             found[i] = sample(target[0], moved[i, 0], moved[i, 1], half + 1, bordered)
         if found[i]:
-            xx, xy, yy = prepare(bordered, inside, seen, gx, gy)
-            found[i] = localisation2(patch, seen, xx, xy, yy) <= most2
+            normal = prepare(bordered, inside, seen, gx, gy)
+            found[i] = localisation2(patch, seen, normal) <= most2
         if found[i]:
             x, y = pixels[i, 0], pixels[i, 1]
-            u, v, converged = align(source[0], x, y, seen, gx, gy, xx, xy, yy, min_gradient)
+            u, v, converged = align(source[0], x, y, seen, gx, gy, normal, min_gradient)
             found[i] = converged and (u - x) ** 2 + (v - y) ** 2 <= max_return_px * max_return_px
     return moved, found
 
@@ -156,15 +156,15 @@ def register(
             source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], inside_border, scratch, bordered
         ):
             continue
-        xx, xy, yy = prepare(bordered, inside, patch, gx, gy)
-        localised[i] = weaker2(xx, xy, yy) >= least2
+        normal = prepare(bordered, inside, patch, gx, gy)
+        localised[i] = weaker2(normal.xx, normal.xy, normal.yy) >= least2
         x, y = guess[i, 0], guess[i, 1]
-        u, v, converged = align(target, x, y, patch, gx, gy, xx, xy, yy, min_gradient)
+        u, v, converged = align(target, x, y, patch, gx, gy, normal, min_gradient)
         if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
             if not sample(target, u, v, half + 1, bordered):
                 continue
-            xx, xy, yy = prepare(bordered, inside, seen, gx, gy)
-            if not localisation2(patch, seen, xx, xy, yy) <= most2:
+            normal = prepare(bordered, inside, seen, gx, gy)
+            if not localisation2(patch, seen, normal) <= most2:
                 continue
             moved[i, 0], moved[i, 1], found[i] = u, v, True
             correlations[i] = correlation(patch, seen)

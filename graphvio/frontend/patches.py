@@ -14,9 +14,14 @@ from graphvio.kernels import fast_kernel, kernel
 LANES = 16
 """Pixels that a vector register holds."""
 
+MIN_CONTRAST, MAX_CONTRAST = 0.4, 2.5
+"""Limits within which an estimated contrast of an image over that of a patch is believed."""
+
 _NOWHERE_PX2 = 1e6
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken, after which the error is several times smaller
+_MIN_SQUARE = np.float32(1e-3)  # of a patch that is not flat
+_ROUNDING = np.float32(1e-6)  # of a sum of squares
 _ONE, _ZERO, _HALF = np.float32(1.0), np.float32(0.0), np.float32(0.5)
 
 
@@ -103,9 +108,29 @@ def sample(image: Image, x: float, y: float, half: int, out: Patch) -> bool:
     return True
 
 
+class NormalEquations(NamedTuple):
+    """What a patch has for its alignment in an image of another brightness and contrast, apart from the image.
+
+    Attributes:
+        xx: Of the normal matrix of the shift, with the contrast eliminated.
+        xy: Likewise.
+        yy: Likewise.
+        px: Gradient along the rows times the patch, summed.
+        py: Gradient along the columns times the patch, summed.
+        pp: The patch times itself, summed.
+    """
+
+    xx: float
+    xy: float
+    yy: float
+    px: float
+    py: float
+    pp: float
+
+
 @fast_kernel
-def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, float]:
-    """Fill a patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy.
+def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) -> NormalEquations:
+    """Fill a patch and its gradients, all of zero mean, and return its normal equations.
 
     Args:
         bordered: the patch with one more pixel on each side.
@@ -123,51 +148,58 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
             values[i] = weights[i] * at[i + 1]
             dx[i] = weights[i] * _HALF * (at[i + 2] - at[i])
             dy[i] = weights[i] * _HALF * (below[i + 1] - above[i + 1])
-    mean = mean_x = mean_y = xx = xy = yy = _ZERO
+    mean = mean_x = mean_y = _ZERO
     flat, flat_x, flat_y, weights = patch.flat, gx.flat, gy.flat, inside.flat
     for k in range(flat.size):
         mean += flat[k]
         mean_x += flat_x[k]
         mean_y += flat_y[k]
-        xx += flat_x[k] * flat_x[k]
-        xy += flat_x[k] * flat_y[k]
-        yy += flat_y[k] * flat_y[k]
     area = np.float32(side * side)
     mean /= area
     mean_x /= area
     mean_y /= area
+    xx = xy = yy = px = py = pp = _ZERO
     for k in range(flat.size):
         flat[k] -= weights[k] * mean
         flat_x[k] -= weights[k] * mean_x
         flat_y[k] -= weights[k] * mean_y
-    return (float(xx - area * mean_x * mean_x), float(xy - area * mean_x * mean_y), float(yy - area * mean_y * mean_y))
+        xx += flat_x[k] * flat_x[k]
+        xy += flat_x[k] * flat_y[k]
+        yy += flat_y[k] * flat_y[k]
+        px += flat_x[k] * flat[k]
+        py += flat_y[k] * flat[k]
+        pp += flat[k] * flat[k]
+    pp = max(pp, _MIN_SQUARE)
+    return NormalEquations(
+        float(xx - px * px / pp), float(xy - px * py / pp), float(yy - py * py / pp), float(px), float(py), float(pp)
+    )
 
 
 @fast_kernel
-def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, bool]:
-    """Sum the gradients times the difference between the image at (u, v) and the patch; False outside the image.
+def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, float, bool]:
+    """Sum gradients and patch times the difference between the image at (u, v) and the patch; False outside the image.
 
-    The gradients have zero mean, so a constant difference of brightness contributes nothing.
+    All three have zero mean, so a constant difference of brightness contributes nothing.
     """
     height, width = image.shape
     side, stride = patch.rows.shape
     half = side // 2
     if not (half <= u < width - half - 1 and half <= v < height - half - 1):
-        return 0.0, 0.0, False
+        return 0.0, 0.0, 0.0, False
     x0, y0 = int(np.floor(u)), int(np.floor(v))
     first = (y0 - half) * width + x0 - half
     if first + side * width + stride >= height * width:
-        return 0.0, 0.0, False  # the padding of the lowest row would read on beyond the image's end
+        return 0.0, 0.0, 0.0, False  # the padding of the lowest row would read on beyond the image's end
     ax, ay = np.float32(u - x0), np.float32(v - y0)
     w00, w01, w10, w11 = (_ONE - ax) * (_ONE - ay), ax * (_ONE - ay), (_ONE - ax) * ay, ax * ay
     flat = image.reshape(-1)
-    bx = by = _ZERO
+    bx = by = bp = _ZERO
     for j in range(side):
         for k in range(0, stride, LANES):
             start = first + j * width + k
             upper, lower = flat[start : start + LANES + 1], flat[start + width : start + width + LANES + 1]
             values, dx, dy = patch.rows[j, k : k + LANES], gx.rows[j, k : k + LANES], gy.rows[j, k : k + LANES]
-            row_x = row_y = _ZERO  # separate sums: a row need not wait for the one before
+            row_x = row_y = row_p = _ZERO  # separate sums: a row need not wait for the one before
             for i in range(LANES):
                 difference = (
                     w00 * np.float32(upper[i])
@@ -178,27 +210,32 @@ def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patc
                 )
                 row_x += dx[i] * difference
                 row_y += dy[i] * difference
+                row_p += values[i] * difference
             bx += row_x
             by += row_y
-    return float(bx), float(by), True
+            bp += row_p
+    return float(bx), float(by), float(bp), True
 
 
 @fast_kernel
 def align(
-    image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch,
-    xx: float, xy: float, yy: float, min_gradient: float,
-) -> tuple[float, float, bool]:  # fmt: skip
+    image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch, normal: NormalEquations, min_gradient: float
+) -> tuple[float, float, bool]:
     """Find a patch in an image by Gauss-Newton from (u, v); the flag says whether the iteration converged.
 
-    A patch whose rms gradient along the weaker direction is less than ``min_gradient`` is not localised.
+    The image may have another brightness and contrast, which is estimated with the shift. A patch whose rms gradient
+    along the weaker direction is less than ``min_gradient`` is not localised.
     """
+    xx, xy, yy = normal.xx, normal.xy, normal.yy
     if weaker2(xx, xy, yy) < min_gradient * min_gradient * len(patch.rows) ** 2:
         return u, v, False
     determinant = xx * yy - xy * xy
     for _ in range(_MAX_ITERATIONS):
-        bx, by, inside = mismatch(image, u, v, patch, gx, gy)
+        bx, by, bp, inside = mismatch(image, u, v, patch, gx, gy)
         if not inside:
             break
+        gain = min(max(1.0 + bp / normal.pp, MIN_CONTRAST), MAX_CONTRAST)
+        bx, by = (bx - (gain - 1.0) * normal.px) / gain, (by - (gain - 1.0) * normal.py) / gain
         step_u = (yy * bx - xy * by) / determinant
         step_v = (xx * by - xy * bx) / determinant
         u -= step_u
@@ -293,13 +330,13 @@ def correlation(patch: Patch, other: Patch) -> float:
         total += b[k]
         own += a[k] * a[k]
     variance = square - total * total / np.float32(len(patch.rows) ** 2)
-    if variance < 1e-3 or own < 1e-3:
+    if variance < max(_MIN_SQUARE, _ROUNDING * square) or own < _MIN_SQUARE:
         return -1.0
     return float(product / np.sqrt(float(variance) * float(own)))
 
 
 @fast_kernel
-def localisation2(patch: Patch, other: Patch, xx: float, xy: float, yy: float) -> float:
+def localisation2(patch: Patch, other: Patch, normal: NormalEquations) -> float:
     """Compute the variance of a patch's place in an image along the weaker direction, square pixels.
 
     Differences between patch and image other than contrast and brightness are taken for white noise. A blurred image
@@ -308,9 +345,7 @@ def localisation2(patch: Patch, other: Patch, xx: float, xy: float, yy: float) -
     Args:
         patch: of zero mean.
         other: the image at the patch's place, of zero mean.
-        xx: normal matrix of ``other``.
-        xy: likewise.
-        yy: likewise.
+        normal: of ``other``.
     """
     a, b = patch.flat, other.flat
     product = own = square = _ZERO
@@ -318,7 +353,7 @@ def localisation2(patch: Patch, other: Patch, xx: float, xy: float, yy: float) -
         product += a[k] * b[k]
         own += a[k] * a[k]
         square += b[k] * b[k]
-    weaker = weaker2(xx, xy, yy)
+    weaker = weaker2(normal.xx, normal.xy, normal.yy)
     if own < 1e-3 or weaker < 1e-3:
         return _NOWHERE_PX2
     return float(square - product * product / own) / (weaker * len(patch.rows) ** 2)

@@ -9,6 +9,8 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.frontend.patches import (
+    MAX_CONTRAST,
+    MIN_CONTRAST,
     Lattice,
     Patch,
     Scratch,
@@ -28,6 +30,7 @@ _CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early w
 _CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
+_SAME_CONTRAST = 1.25  # a smaller ratio is taken for 1
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 _Columns = tuple[Patch, Patch, Patch, Patch]
@@ -66,20 +69,25 @@ def align_slanted(
     for i in range(n):
         if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
             continue
-        xx, xy, yy = prepare(bordered, grid.inside, patch, columns[0], columns[1])
+        normal = prepare(bordered, grid.inside, patch, columns[0], columns[1])
         ex, ey = directions[i, 0], directions[i, 1]
         parameters[0], parameters[1] = guess[i, 0], guess[i, 1]
         parameters[2], parameters[3] = slopes[i, 0], slopes[i, 1]
         if not known[i]:
             parameters[0], parameters[1], _ = align(
-                right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], xx, xy, yy, 0.0
+                right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], normal, 0.0
             )
         _steepest_descent(columns, grid, ex, ey)
-        _factorise(columns, xx, xy, yy, factor)
-        for _ in range(_MAX_ITERATIONS):
+        gain = 1.0
+        for k in range(_MAX_ITERATIONS):
             if not _sample_sheared(packed_right, parameters, ex, ey, grid.inside, scratch, sheared):
                 break
-            _project(columns, sheared, patch, step)
+            if k == 0:
+                gain = _different_contrast(sheared, normal.pp)
+                if gain != 1.0:
+                    _eliminate_contrast(columns, patch, normal.pp)
+                _factorise(columns, factor)
+            _project(columns, sheared, patch, gain, step)
             _solve(factor, step)
             _compose(parameters, step, ex, ey)
             if _is_small(step):
@@ -112,11 +120,48 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
 
 
 @fast_kernel
-def _factorise(columns: _Columns, xx: float, xy: float, yy: float, factor: Float) -> None:
-    """Fill the lower Cholesky factor (4, 4) of the normal matrix, of which the block of the shift is given."""
+def _different_contrast(sheared: Patch, pp: float) -> float:
+    """Return the contrast of the image over that of the patch, given its square, or 1 where they are nearly the same.
+
+    To estimate it costs precision of the slopes, which is lost for nothing where both images are exposed alike.
+    """
+    total = square = np.float32(0.0)
+    for value in sheared.flat:
+        total += value
+        square += value * value
+    variance = float(square - total * total / np.float32(len(sheared.rows) ** 2))
+    ratio = min(max(np.sqrt(max(variance, 0.0) / pp), MIN_CONTRAST), MAX_CONTRAST)
+    return 1.0 if 1.0 / _SAME_CONTRAST < ratio < _SAME_CONTRAST else ratio
+
+
+@fast_kernel
+def _eliminate_contrast(columns: _Columns, patch: Patch, pp: float) -> None:
+    """Make the derivatives orthogonal to the patch, given its square: another contrast then moves no parameter."""
+    c0, c1, c2, c3, values = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat, patch.flat
+    p0 = p1 = p2 = p3 = np.float32(0.0)
+    for k in range(values.size):
+        p0 += c0[k] * values[k]
+        p1 += c1[k] * values[k]
+        p2 += c2[k] * values[k]
+        p3 += c3[k] * values[k]
+    square = np.float32(pp)
+    p0, p1, p2, p3 = p0 / square, p1 / square, p2 / square, p3 / square
+    for k in range(values.size):
+        c0[k] -= p0 * values[k]
+        c1[k] -= p1 * values[k]
+        c2[k] -= p2 * values[k]
+        c3[k] -= p3 * values[k]
+
+
+@fast_kernel
+def _factorise(columns: _Columns, factor: Float) -> None:
+    """Fill the lower Cholesky factor (4, 4) of the normal matrix."""
     c0, c1, c2, c3 = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
-    h02 = h03 = h12 = h13 = h22 = h23 = h33 = np.float32(0.0)
+    h00 = h01 = h11 = h02 = h03 = h12 = h13 = h22 = h23 = h33 = np.float32(0.0)
     for k in range(c0.size):
+        h00 += c0[k] * c0[k]
+        h01 += c0[k] * c1[k]
+        h11 += c1[k] * c1[k]
         h02 += c0[k] * c2[k]
         h03 += c0[k] * c3[k]
         h12 += c1[k] * c2[k]
@@ -124,7 +169,7 @@ def _factorise(columns: _Columns, xx: float, xy: float, yy: float, factor: Float
         h22 += c2[k] * c2[k]
         h23 += c2[k] * c3[k]
         h33 += c3[k] * c3[k]
-    factor[0, 0], factor[1, 0], factor[1, 1] = xx + _SHIFT_PRIOR, xy, yy + _SHIFT_PRIOR
+    factor[0, 0], factor[1, 0], factor[1, 1] = h00 + _SHIFT_PRIOR, h01, h11 + _SHIFT_PRIOR
     factor[2, 0], factor[2, 1], factor[2, 2] = h02, h12, h22 + _SLOPE_PRIOR
     factor[3, 0], factor[3, 1], factor[3, 2], factor[3, 3] = h03, h13, h23, h33 + _SLOPE_PRIOR
     for a in range(4):
@@ -177,13 +222,14 @@ def _compose(parameters: Float, step: Float, ex: float, ey: float) -> None:
 
 
 @fast_kernel
-def _project(columns: _Columns, sheared: Patch, patch: Patch, out: Float) -> None:
-    """Fill the derivatives times the difference of the patches (4,)."""
+def _project(columns: _Columns, sheared: Patch, patch: Patch, gain: float, out: Float) -> None:
+    """Fill the derivatives times the difference of the patches (4,), the sheared one with its contrast taken off."""
     c0, c1, c2, c3 = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
     seen, expected = sheared.flat, patch.flat
     b0 = b1 = b2 = b3 = np.float32(0.0)
+    inverse = np.float32(1.0 / gain)
     for k in range(seen.size):
-        difference = seen[k] - expected[k]
+        difference = inverse * seen[k] - expected[k]
         b0 += c0[k] * difference
         b1 += c1[k] * difference
         b2 += c2[k] * difference
