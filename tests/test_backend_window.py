@@ -267,3 +267,23 @@ def test_values_that_hardly_change_lose_no_digits(walk: float) -> None:
     np.testing.assert_allclose(window.values.atVector(x(9)), np.ones(3), rtol=1e-6)
     np.testing.assert_allclose(window.joint_covariance([x(9)]), (0.25 + 9 * walk**2) * unit, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(window.joint_covariance([x(0)]), 0.25 * unit, rtol=1e-6, atol=1e-9)
+
+
+def test_optimize_shortens_a_step_that_makes_it_worse() -> None:
+    """Gauss-Newton from 3 to the zero of the arc tangent leaps to -9.5, and from there ever farther away."""
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        at = values.atVector(factor.keys()[0])
+        if jacobians is not None:
+            jacobians[0] = np.array([[1.0 / (1.0 + at[0] ** 2)]])
+        return np.arctan(at)
+
+    window = Window()
+    window.values.insert(0, np.array([3.0]))
+    window.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, 0.1), [0], error))
+    errors = []
+    for _ in range(5):
+        window.optimize()
+        errors.append(abs(window.values.atVector(0)[0]))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1e-3

@@ -15,6 +15,7 @@ from graphvio.backend.marginal import Marginal, marginal_of_last
 from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
+_STEP_SHARES = (1.0, 0.5, 0.25, 0.125)
 _CONVERGED = 1e-2  # radians, metres...: another step would change the square of this
 
 
@@ -68,9 +69,11 @@ class Window:
                 largest = np.abs(step.vector()).max()
                 if not np.isfinite(largest):
                     raise WindowError("the window's solution is not finite")
-                self.values = self.values.retract(step)
+                is_last = largest < _CONVERGED and iteration >= self._min_iterations
+                moved = self.values.retract(step) if is_last else self._improved(step)
+                self.values = moved or self.values
                 self._marginal = self._marginal and self._marginal.at_solution()
-                if largest < _CONVERGED and iteration >= self._min_iterations:
+                if is_last or moved is None:
                     break
         except RuntimeError as error:
             self.values, self._marginal = values, None
@@ -154,6 +157,19 @@ class Window:
         for key in leaving:
             self.values.erase(key)
         self._known_keys -= leaving
+
+    def _improved(self, step: gtsam.VectorValues) -> gtsam.Values | None:
+        """Return the values after a long step, or a part of it, or None where all of these are worse.
+
+        Where a direction is hardly constrained, such as the heading after time without images and IMU, a step along it
+        may leave the range in which the equations are linear.
+        """
+        before = self._graph.error(self.values)
+        for share in _STEP_SHARES:
+            values = self.values.retract(step.scale(share))
+            if self._graph.error(values) <= before:
+                return values
+        return None
 
     def _insert(self, factor: gtsam.NonlinearFactor) -> int:
         """Put a factor into a free slot of the graph, and return the slot."""
