@@ -11,6 +11,7 @@ from graphvio.config import Config
 from graphvio.frontend.corners import find_corners, noise_sigma, occupied_cells, thinned
 from graphvio.frontend.images import ImageMask, UsablePixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
+from graphvio.frontend.lost_tracks import image_shift, motion_of_found
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
@@ -21,6 +22,8 @@ from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
 from graphvio.rig import CameraGroup, StereoPair
 from graphvio.timing import Stopwatch
 
+_MIN_FOUND = 0.7  # share of the tracks, below which the others are looked for where these foretell them
+_MAX_ROUNDS = 3
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FLAT_FRAMES = 3  # then the track is dropped for another corner of its cell
 _LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks that fail are tried again with all
@@ -233,19 +236,12 @@ class PairTracker:
         if left_T_left_keyframe is not None and left_T_left_prev is not None:
             pixels, found = self._patches.find(last.ids, guess, self._left[0], left_T_left_keyframe, self._min_gradient)
         watch.lap("register")
-        others, settings = np.flatnonzero(~found), self._config.tracking
+        others = np.flatnonzero(~found)
         if len(others):
-            pixels[others], found[others] = track(
-                before,
-                self._left,
-                last.pixels[others],
-                guess[others],
-                window_px=settings.window_px,
-                levels=settings.levels,
-                max_return_px=settings.max_forward_backward_px,
-                min_gradient=self._min_gradient,
-                first_levels=None if left_T_left_prev is None else _LEVELS_AFTER_PREDICTION,
-            )
+            is_near = left_T_left_prev is not None
+            pixels[others], found[others] = self._tracked(before, last.pixels[others], guess[others], is_near)
+        if found.sum() < _MIN_FOUND * len(found):
+            pixels, found = self._follow_again(before, last, pixels, found)
         watch.lap("flow")
         if left_T_left_keyframe is not None:
             others = others[found[others]]
@@ -254,6 +250,41 @@ class PairTracker:
             )
         watch.lap("register")
         return pixels, found
+
+    def _follow_again(self, before: Pyramid, last: PairFrame, pixels: Float, found: Bool) -> tuple[Float, Bool]:
+        """Look for lost tracks where those that were found foretell them, or else where the whole image has moved."""
+        camera = self._pair.left
+        w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
+        for _ in range(_MAX_ROUNDS):
+            rays, has_ray = camera.unproject(pixels)
+            moved = motion_of_found(last.left, w, rays, found & has_ray, camera.focal_px)
+            if moved is not None:
+                guess, _, valid = predict_pixels(
+                    last.left, w, moved, camera.model_number, camera.intrinsics, camera.distortion
+                )
+            else:
+                shift_px = image_shift(before[-1], self._left[-1]) * 2 ** (len(before) - 1)
+                guess, valid = last.pixels + shift_px, np.ones(len(found), dtype=bool)
+            again = np.flatnonzero(~found & valid & camera.contains(guess))
+            pixels[again], found[again] = self._tracked(before, last.pixels[again], guess[again], moved is not None)
+            if not found[again].any():
+                break
+        return pixels, found
+
+    def _tracked(self, before: Pyramid, then: Float, guess: Float, is_near: bool) -> tuple[Float, Bool]:
+        """Track pixels (N, 2) of the previous image, from a guess that may be near."""
+        settings = self._config.tracking
+        return track(
+            before,
+            self._left,
+            then,
+            guess,
+            window_px=settings.window_px,
+            levels=settings.levels,
+            max_return_px=settings.max_forward_backward_px,
+            min_gradient=self._min_gradient,
+            first_levels=_LEVELS_AFTER_PREDICTION if is_near else None,
+        )
 
     def _still_wanted(self, pixels: Float, found: Bool, rejected: dict[str, int]) -> Bool:
         """Select the tracks (N,) that stay: found, where the image may be used, and not crowded together."""
