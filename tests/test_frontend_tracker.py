@@ -197,7 +197,7 @@ def test_observe_with_a_wrong_prediction_loses_few_tracks() -> None:
     assert np.isin(first.ids, second.ids).mean() > 0.7
 
 
-def test_observe_through_a_fast_turn_needs_a_prediction() -> None:
+def test_observe_through_a_fast_turn_finds_the_tracks() -> None:
     """By 14 degrees from one image to the next, as a head may turn at 5 rad/s: 60 pixels, of 320."""
     turned = transform([0.0, 0.24, 0.0], [0.0, 0.0, 0.0])
     shares, errors_px = [], []
@@ -212,7 +212,7 @@ def test_observe_through_a_fast_turn_needs_a_prediction() -> None:
         off_px = np.hypot(*(second.pixels[now] - true[then]).T)
         shares.append(float(np.sum(off_px < 0.5) / in_view.sum()))
         errors_px.append(float(np.median(off_px)) if len(off_px) else np.inf)
-    assert shares[0] < 0.3
+    assert shares[0] > 0.6  # by those that are found anyway, and by the shift of the whole image
     assert shares[1] > 0.8
     assert errors_px[1] < 0.2
 

@@ -2,7 +2,7 @@
 
 Inverse compositional (S. Baker, I. Matthews, *Lucas-Kanade 20 years on*, IJCV 56(3), 2004): gradients and normal
 matrix belong to the patch and are computed once for all iterations. The patch's mean brightness is left out of the
-comparison, and its contrast is estimated with the shift, so that a change of exposure moves no point.
+comparison, so that a change of exposure moves no point; between two cameras, contrast is estimated with the shift.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _forth_and_back(
 @fast_kernel
 def register(
     source: AnyArray, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
-    max_shift_px: float, min_gradient: float,
+    max_shift_px: float, min_gradient: float, is_other_camera: bool = False,
 ) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
     """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
 
@@ -137,6 +137,7 @@ def register(
         half: of the patch's side, without its middle.
         max_shift_px: largest distance from the guess.
         min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
+        is_other_camera: whether the images are of two cameras, which may be exposed differently.
 
     Returns:
         Pixels (N, 2), equal to the guess where not found; whether each was found (N,), also to a sigma of 0.2 px along
@@ -159,7 +160,7 @@ def register(
         normal = prepare(bordered, inside, patch, gx, gy)
         localised[i] = weaker2(normal.xx, normal.xy, normal.yy) >= least2
         x, y = guess[i, 0], guess[i, 1]
-        u, v, converged = align(target, x, y, patch, gx, gy, normal, min_gradient)
+        u, v, converged = align(target, x, y, patch, gx, gy, normal, min_gradient, is_other_camera)
         if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
             if not sample(target, u, v, half + 1, bordered):
                 continue

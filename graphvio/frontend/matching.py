@@ -175,6 +175,7 @@ class StereoMatcher:
                 half,
                 tracking.max_forward_backward_px,
                 min_gradient,
+                True,
             )
         found = passes(found, localised, "corner", rejected)
         return matched, slopes, passes(found, returned, "left_right", rejected)

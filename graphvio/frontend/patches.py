@@ -14,9 +14,8 @@ from graphvio.kernels import fast_kernel, kernel
 LANES = 16
 """Pixels that a vector register holds."""
 
-MIN_CONTRAST, MAX_CONTRAST = 0.4, 2.5
-"""Limits within which an estimated contrast of an image over that of a patch is believed."""
-
+_MIN_CONTRAST, _MAX_CONTRAST = 0.4, 2.5  # of an image over that of a patch, as far as it is believed
+_SAME_CONTRAST = 1.25  # a smaller ratio is taken for 1
 _NOWHERE_PX2 = 1e6
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken, after which the error is several times smaller
@@ -112,7 +111,7 @@ class NormalEquations(NamedTuple):
     """What a patch has for its alignment in an image of another brightness and contrast, apart from the image.
 
     Attributes:
-        xx: Of the normal matrix of the shift, with the contrast eliminated.
+        xx: Of the normal matrix of the shift.
         xy: Likewise.
         yy: Likewise.
         px: Gradient along the rows times the patch, summed.
@@ -169,10 +168,7 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
         px += flat_x[k] * flat[k]
         py += flat_y[k] * flat[k]
         pp += flat[k] * flat[k]
-    pp = max(pp, _MIN_SQUARE)
-    return NormalEquations(
-        float(xx - px * px / pp), float(xy - px * py / pp), float(yy - py * py / pp), float(px), float(py), float(pp)
-    )
+    return NormalEquations(float(xx), float(xy), float(yy), float(px), float(py), float(max(pp, _MIN_SQUARE)))
 
 
 @fast_kernel
@@ -218,13 +214,27 @@ def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patc
 
 
 @fast_kernel
+def different_contrast(ratio: float) -> float:
+    """Return the contrast of an image over that of a patch, or 1 where they are nearly the same.
+
+    To estimate it costs precision, which is lost for nothing where both images are exposed alike: a patch that is seen
+    larger, or slanted otherwise, seems to have another contrast, too.
+    """
+    if 1.0 / _SAME_CONTRAST < ratio < _SAME_CONTRAST:
+        return 1.0
+    return min(max(ratio, _MIN_CONTRAST), _MAX_CONTRAST)
+
+
+@fast_kernel
 def align(
-    image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch, normal: NormalEquations, min_gradient: float
-) -> tuple[float, float, bool]:
+    image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch, normal: NormalEquations, min_gradient: float,
+    is_other_camera: bool = False,
+) -> tuple[float, float, bool]:  # fmt: skip
     """Find a patch in an image by Gauss-Newton from (u, v); the flag says whether the iteration converged.
 
-    The image may have another brightness and contrast, which is estimated with the shift. A patch whose rms gradient
-    along the weaker direction is less than ``min_gradient`` is not localised.
+    The image may have another brightness, and that of another camera another contrast, which is estimated with the
+    shift if it clearly differs. A patch whose rms gradient along the weaker direction is less than ``min_gradient`` is
+    not localised.
     """
     xx, xy, yy = normal.xx, normal.xy, normal.yy
     if weaker2(xx, xy, yy) < min_gradient * min_gradient * len(patch.rows) ** 2:
@@ -234,8 +244,9 @@ def align(
         bx, by, bp, inside = mismatch(image, u, v, patch, gx, gy)
         if not inside:
             break
-        gain = min(max(1.0 + bp / normal.pp, MIN_CONTRAST), MAX_CONTRAST)
-        bx, by = (bx - (gain - 1.0) * normal.px) / gain, (by - (gain - 1.0) * normal.py) / gain
+        if is_other_camera:
+            gain = different_contrast(1.0 + bp / normal.pp)
+            bx, by = (bx - (gain - 1.0) * normal.px) / gain, (by - (gain - 1.0) * normal.py) / gain
         step_u = (yy * bx - xy * by) / determinant
         step_v = (xx * by - xy * bx) / determinant
         u -= step_u

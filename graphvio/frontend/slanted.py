@@ -9,13 +9,12 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.frontend.patches import (
-    MAX_CONTRAST,
-    MIN_CONTRAST,
     Lattice,
     Patch,
     Scratch,
     align,
     correlation,
+    different_contrast,
     lattice,
     prepare,
     room,
@@ -30,7 +29,6 @@ _CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early w
 _CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
-_SAME_CONTRAST = 1.25  # a smaller ratio is taken for 1
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 _Columns = tuple[Patch, Patch, Patch, Patch]
@@ -75,7 +73,7 @@ def align_slanted(
         parameters[2], parameters[3] = slopes[i, 0], slopes[i, 1]
         if not known[i]:
             parameters[0], parameters[1], _ = align(
-                right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], normal, 0.0
+                right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], normal, 0.0, True
             )
         _steepest_descent(columns, grid, ex, ey)
         gain = 1.0
@@ -83,7 +81,7 @@ def align_slanted(
             if not _sample_sheared(packed_right, parameters, ex, ey, grid.inside, scratch, sheared):
                 break
             if k == 0:
-                gain = _different_contrast(sheared, normal.pp)
+                gain = different_contrast(_contrast(sheared, normal.pp))
                 if gain != 1.0:
                     _eliminate_contrast(columns, patch, normal.pp)
                 _factorise(columns, factor)
@@ -120,18 +118,14 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
 
 
 @fast_kernel
-def _different_contrast(sheared: Patch, pp: float) -> float:
-    """Return the contrast of the image over that of the patch, given its square, or 1 where they are nearly the same.
-
-    To estimate it costs precision of the slopes, which is lost for nothing where both images are exposed alike.
-    """
+def _contrast(sheared: Patch, pp: float) -> float:
+    """Return the contrast of the image over that of the patch, given its square."""
     total = square = np.float32(0.0)
     for value in sheared.flat:
         total += value
         square += value * value
     variance = float(square - total * total / np.float32(len(sheared.rows) ** 2))
-    ratio = min(max(np.sqrt(max(variance, 0.0) / pp), MIN_CONTRAST), MAX_CONTRAST)
-    return 1.0 if 1.0 / _SAME_CONTRAST < ratio < _SAME_CONTRAST else ratio
+    return float(np.sqrt(max(variance, 0.0) / pp))
 
 
 @fast_kernel

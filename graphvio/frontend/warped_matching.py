@@ -72,7 +72,7 @@ class WarpedMatcher(StereoMatcher):
         found = passes(np.ones(len(pixels), dtype=bool), seen & usable & in_reach, "search", rejected)
         pack(left[0], self._packed_left)
         matched, registered, localised, correlations = register(
-            self._packed_left, right[0], pixels + shifts, warps, guess, found, half, _MAX_SHIFT_PX, min_gradient
+            self._packed_left, right[0], pixels + shifts, warps, guess, found, half, _MAX_SHIFT_PX, min_gradient, True
         )
         found = passes(found, registered, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
