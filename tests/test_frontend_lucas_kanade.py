@@ -75,7 +75,9 @@ def test_track_along_a_blur_is_rejected() -> None:
         flowed, found = track(
             sharp, build_pyramid(target, LEVELS), grid(), grid(), window_px=15, levels=1, max_return_px=0.5
         )
-        registered, there, _, _ = register(packed(sharp[0]), target, grid(), level, grid(), everything, 7, 2.0, 0.5)
+        registered, there, _, _ = register(
+            packed(sharp[0]), target, grid(), level, grid(), everything, 7, 2.0, 0.5, False
+        )
         kept.append((found.mean(), there.mean()))
         for places, good in ((flowed, found), (registered, there)):
             if good.sum() > 5:
@@ -161,7 +163,7 @@ def registered(number: int, assumed: Float, guess_error: Float) -> tuple[Float, 
     for middle, target in deformed(number):
         guess = (PLACE + guess_error)[None]
         moved, ok, _, _ = register(
-            packed(source), target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0
+            packed(source), target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0, False
         )
         errors.append(moved[0] - PLACE)
         found.append(ok[0])
@@ -190,15 +192,17 @@ def test_register_returns_the_guess_where_it_fails() -> None:
     guess, n = pixels + np.array([0.3, 0.2]), len(pixels)
     warps, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
     for source, target, wanted in ((image, image, ~everything), (flat, image, everything)):
-        moved, found, localised, _ = register(packed(source), target, pixels, warps, guess, wanted, 7, 2.0, 1.0)
+        moved, found, localised, _ = register(packed(source), target, pixels, warps, guess, wanted, 7, 2.0, 1.0, False)
         np.testing.assert_array_equal(moved, guess)
         assert not found.any()
         assert not localised.any()
-    moved, found, localised, _ = register(packed(image), image, pixels, warps, guess, everything, 7, 2.0, 1.0)
+    moved, found, localised, _ = register(packed(image), image, pixels, warps, guess, everything, 7, 2.0, 1.0, False)
     np.testing.assert_array_equal(found, [True, True, True, False, False, False])
     np.testing.assert_array_equal(localised, found)
     np.testing.assert_array_equal(moved[~found], guess[~found])
-    _, found, _, _ = register(packed(image), image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
+    _, found, _, _ = register(
+        packed(image), image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0, False
+    )
     assert not found.any()  # they are farther from the guess than that
 
 

@@ -67,7 +67,7 @@ def test_align_slanted_without_slopes_is_off_or_fails(slant: tuple[float, float]
     images, right = views(*slant), truth(grid(), *slant)
     n, packed_left = len(right), packed(images[0])
     level, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
-    shifted, kept, _, _ = register(packed_left, images[1], grid(), level, right, everything, HALF, 3.0, 1.0)
+    shifted, kept, _, _ = register(packed_left, images[1], grid(), level, right, everything, HALF, 3.0, 1.0, True)
     moved, _, _, found = aligned(images, right)
     by_shift = np.where(kept, np.linalg.norm(shifted - right, axis=1), np.inf)
     by_slant = np.where(found, np.linalg.norm(moved - right, axis=1), np.inf)

@@ -16,16 +16,12 @@ from typer.testing import CliRunner
 import graphvio.kernel_cache
 import graphvio.kernels
 import graphvio.warmup
-from graphvio import FrameSet, ImuSample, Odometry
 from graphvio.arrays import Image
 from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.frontend.visual import VisualFrontend
-from graphvio.simulation import default_rig, make_simulator
-from graphvio.slam import FrontEnd
-from graphvio.slam.keyframe import Keyframe
+from graphvio.simulation import default_rig
 from graphvio.warmup import warm_up
 
 _FRAMES = 6
@@ -38,39 +34,6 @@ def compiled() -> set[tuple[str, str, Any]]:
         for kernel in graphvio.kernels._registered
         for signature in kernel.signatures
     }
-
-
-def test_no_kernel_is_compiled_after_the_warm_up() -> None:
-    simulator = make_simulator("room", duration_s=0.5)
-    framesets = [simulator.frameset(k) for k in range(_FRAMES)]
-    track = simulator.imu_track
-    samples = [
-        ImuSample(int(stamp_ns), rate, force)
-        for stamp_ns, rate, force in zip(
-            track.stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True
-        )
-    ]
-    warm_up(default_rig(), Config())
-    before = compiled()
-    assert len(before) > 20
-    assert "_linearised" in {name for _, name, _ in before}  # of pairs' places, needed after some keyframes
-    frontend = VisualFrontend(simulator.rig, Config())
-    for frameset in framesets:
-        result = frontend.process(frameset, lambda _: np.eye(4))
-    frontend.close()
-    assert result.motion is not None
-    assert compiled() - before == set()
-    one_a_frameset = samples[:: len(samples) // (10 * _FRAMES // 6)]
-    for rig, used in ((simulator.rig, samples), (simulator.rig, one_a_frameset), (simulator.rig.without_imu(), [])):
-        odometry = Odometry(rig)
-        keyframes: list[Keyframe] = []
-        FrontEnd(odometry).on_keyframe(keyframes.append)
-        both: list[FrameSet | ImuSample] = [*used, *framesets]
-        for measurement in sorted(both, key=lambda measurement: measurement.stamp_ns):
-            odometry.process(measurement)
-        odometry.finish()
-        assert keyframes
-        assert compiled() - before == set()
 
 
 def test_warm_up_of_a_pair_gives_each_camera_images_of_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,29 +51,42 @@ def test_warm_up_of_a_pair_gives_each_camera_images_of_its_size(monkeypatch: pyt
     assert given == {(pair.left.size_px, small.size_px)}
 
 
-def test_no_kernel_of_single_cameras_is_compiled_after_the_warm_up(room_walk: Path) -> None:
+@pytest.mark.parametrize("which", ["pairs", "few_samples", "without_imu", "pair_and_single", "singles"])
+def test_no_kernel_is_compiled_after_the_warm_up(which: str, room_walk: Path) -> None:
     """In a process of its own, which has not run anything else; the walk lasts until the calibration is estimated."""
     ran = subprocess.run(
-        [sys.executable, "-c", _RUN_SINGLES, str(room_walk)], capture_output=True, text=True, cwd=Path(__file__).parent
+        [sys.executable, "-c", _WALK, which, str(room_walk)], capture_output=True, text=True, cwd=Path(__file__).parent
     )
     assert ran.returncode == 0, ran.stderr
 
 
-_RUN_SINGLES = """
+_WALK = """
 import sys
 from test_warmup import compiled
-from graphvio import Odometry, open_source
+from graphvio import ImuSample, Odometry, open_source
 from graphvio.config import Config
 from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.slam import FrontEnd
 from graphvio.warmup import warm_up
 
-source = open_source(sys.argv[1])
-rig = draw(source.rig, CalibrationError.of_level(3, ["pair-transform"]), 1).written_rig.without_pairs()
+which, recording = sys.argv[1:]
+rig = draw(open_source(recording).rig, CalibrationError.of_level(3, ["pair-transform"]), 1).written_rig
+rig = {"singles": rig.without_pairs, "without_imu": rig.without_imu}.get(which, lambda: rig)()
+if which == "pair_and_single":
+    rig = rig.with_only(["0", "1", "2"])
 warm_up(rig, Config())
 before = compiled()
-odometry = Odometry(rig)
-for measurement in open_source(sys.argv[1], rig):
+assert len(before) > 20
+odometry, keyframes, samples = Odometry(rig), [], 0
+FrontEnd(odometry).on_keyframe(keyframes.append)
+for measurement in open_source(recording, rig):
+    if isinstance(measurement, ImuSample):
+        samples += 1
+        if which == "without_imu" or (which == "few_samples" and samples % 10):
+            continue
     odometry.process(measurement)
+odometry.finish()
+assert keyframes
 assert odometry.calibration is not None and not odometry.calibration.is_file_exact
 assert compiled() == before, compiled() - before
 """

@@ -134,6 +134,7 @@ class KeyframePatches:
             self._half,
             _MAX_REGISTRATION_PX,
             min_gradient,
+            False,
         )
         found &= correlations > _SAME_PATCH
         pixels[~found] = guess[~found]

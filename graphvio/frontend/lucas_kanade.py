@@ -103,7 +103,7 @@ def _forth_and_back(
             if not sample(source[level], x, y, half + 1, bordered):
                 continue  # near the edge of a coarse level: the finer ones may still see it
             normal = prepare(bordered, inside, patch, gx, gy)
-            u, v, converged = align(target[level], u, v, patch, gx, gy, normal, min_gradient)
+            u, v, converged = align(target[level], u, v, patch, gx, gy, normal, min_gradient, False)
             if converged or level > 0:
                 moved[i, 0], moved[i, 1] = u / scale, v / scale
             found[i] = converged and level == 0
@@ -115,7 +115,7 @@ def _forth_and_back(
             found[i] = localisation2(patch, seen, normal) <= most2
         if found[i]:
             x, y = pixels[i, 0], pixels[i, 1]
-            u, v, converged = align(source[0], x, y, seen, gx, gy, normal, min_gradient)
+            u, v, converged = align(source[0], x, y, seen, gx, gy, normal, min_gradient, False)
             found[i] = converged and (u - x) ** 2 + (v - y) ** 2 <= max_return_px * max_return_px
     return moved, found
 
@@ -123,7 +123,7 @@ def _forth_and_back(
 @fast_kernel
 def register(
     source: AnyArray, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
-    max_shift_px: float, min_gradient: float, is_other_camera: bool = False,
+    max_shift_px: float, min_gradient: float, is_other_camera: bool,
 ) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
     """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
 

@@ -228,7 +228,7 @@ def different_contrast(ratio: float) -> float:
 @fast_kernel
 def align(
     image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch, normal: NormalEquations, min_gradient: float,
-    is_other_camera: bool = False,
+    is_other_camera: bool,
 ) -> tuple[float, float, bool]:  # fmt: skip
     """Find a patch in an image by Gauss-Newton from (u, v); the flag says whether the iteration converged.
 
