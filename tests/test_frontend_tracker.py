@@ -14,7 +14,6 @@ from waves import picture, waves
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.config import Config
 from graphvio.config.stages import CornerConfig
-from graphvio.frontend.corners import noise_sigma
 from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracker import PairTracker
@@ -343,15 +342,3 @@ def test_weak_corners_are_not_added_to_a_rich_image() -> None:
         frame = tracker.observe(0, *views(np.eye(4)), None, None)
         frames.append(frame if len(frame.ids) else tracker.replenish())
     np.testing.assert_array_equal(frames[0].pixels, frames[1].pixels)
-
-
-def test_noise_sigma_ignores_texture() -> None:
-    flat = np.full((HEIGHT, WIDTH), 100.0)
-    for sigma in (0.7, 2.0, 6.0):
-        white = sigma * np.random.default_rng(1).standard_normal(flat.shape)
-        for scene in (flat, flat + 0.2 * X, flat + 40.0 * (X > 150)):
-            assert noise_sigma(np.round(scene + white).astype(np.uint8)) == pytest.approx(sigma, rel=0.12)
-        smooth = picture(waves(0.5 * X, 0.5 * Y) + white / 45.0)
-        assert noise_sigma(smooth) == pytest.approx(sigma, rel=0.5)
-    assert noise_sigma(flat.astype(np.uint8)) == pytest.approx(1.0 / np.sqrt(12.0))  # rounding is noise
-    assert noise_sigma(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)) > 0.0

@@ -1,4 +1,4 @@
-"""Harris corners, one in each cell of the image that has no track (section 3 and its reference [5]); image noise."""
+"""Harris corners, one in each cell of the image that has no track (section 3 and its reference [5])."""
 
 import numpy as np
 
@@ -9,10 +9,6 @@ _HARRIS_K = 0.04
 _RADIUS = 3  # of the 7x7 window over which gradients are summed
 _BORDER = 2  # around a cell: one pixel to smooth the response, one to check that it peaks
 _LANES = 32  # numbers that a loop takes at once
-_NOISE_STEP = 6  # pixels and rows from one sample to the next
-_MAX_RESPONSE = 2047
-_NOISE_QUANTILE = 0.5
-_NOISE_GAIN = 6.0 * 0.6745  # the operator's gain on the noise's deviation, times a normal deviate's median
 
 
 @kernel
@@ -231,34 +227,3 @@ def _peak_offset(before: float, at: float, after: float) -> float:
     if curvature >= 0.0:
         return 0.0
     return min(max(0.5 * (before - after) / curvature, -0.5), 0.5)
-
-
-@kernel
-def noise_sigma(image: Image) -> float:
-    """Estimate the standard deviation of an image's noise in grey levels, at least that of rounding to whole ones.
-
-    The operator of J. Immerkaer (*Fast noise variance estimation*, CVIU 64(2), 1996) is blind to anything that is
-    linear along rows or columns; the median over the image leaves out most of the remaining texture. Pixels that are
-    black or saturated show no noise and do not count.
-    """
-    height, width = image.shape
-    histogram = np.zeros(_MAX_RESPONSE + 1, dtype=np.int64)
-    count = 0
-    for y in range(1, height - 1, _NOISE_STEP):
-        for x in range(1, width - 1, _NOISE_STEP):
-            middle = int(image[y, x])
-            if middle == 0 or middle == 255:
-                continue
-            corners = int(image[y - 1, x - 1]) + int(image[y - 1, x + 1])
-            corners += int(image[y + 1, x - 1]) + int(image[y + 1, x + 1])
-            edges = int(image[y - 1, x]) + int(image[y + 1, x]) + int(image[y, x - 1]) + int(image[y, x + 1])
-            histogram[min(abs(corners - 2 * edges + 4 * middle), _MAX_RESPONSE)] += 1
-            count += 1
-    rounding = float(1.0 / np.sqrt(12.0))
-    below = 0
-    for value in range(_MAX_RESPONSE + 1):
-        if below + histogram[value] > _NOISE_QUANTILE * count:
-            within = (_NOISE_QUANTILE * count - below) / histogram[value]
-            return float(max((value - 0.5 + within) / _NOISE_GAIN, rounding))
-        below += histogram[value]
-    return rounding

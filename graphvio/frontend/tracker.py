@@ -8,7 +8,8 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
-from graphvio.frontend.corners import find_corners, noise_sigma, occupied_cells, thinned
+from graphvio.frontend.corners import find_corners, occupied_cells, thinned
+from graphvio.frontend.image_noise import NoiseFilter, noise_sigma
 from graphvio.frontend.images import ImageMask, UsablePixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lost_tracks import image_shift, motion_of_found
@@ -61,7 +62,7 @@ class PairTracker:
         self._left: Pyramid = ()
         self._right: Pyramid = ()
         self._patches = KeyframePatches(pair, config.tracking.window_px)
-        self._noise_sigma = 0.0
+        self._noise_filter, self._noise_sigma = NoiseFilter(), 0.0
         self._motion: ReadoutMotion | None = None
 
     def observe(
@@ -87,6 +88,7 @@ class PairTracker:
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
+        left, right = self._noise_filter.filtered(left, right)
         self._left, self._right = build_pyramid(left, levels), () if right is None else build_pyramid(right, 2)
         self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:

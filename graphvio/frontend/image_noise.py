@@ -1,0 +1,99 @@
+"""Image noise: how large it is against what an image shows, and smoothing while it is too large.
+
+Patches that are mostly noise look like nothing in another image: tracks still survive, since they are searched where
+they are predicted, but few corners are found along their epipolar lines. Smoothed by a pixel they are found again.
+Clean images are left alone, since smoothing costs sharp ones precision.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from graphvio.arrays import Image
+from graphvio.kernels import kernel
+
+_GAIN = 6.0 * 0.6745  # the operator's gain on the noise's deviation, times a normal deviate's median
+_QUANTILE = 0.5
+_STEP = 6  # pixels and rows from one sample of the noise to the next
+_MAX_RESPONSE = 2047
+_BLOCK_PX, _BLOCK_STEP = 16, 2
+_TEXTURED = 0.75  # quantile of blocks by contrast: corners lie in the better ones
+_MIN_TO_SMOOTH, _MIN_TO_GO_ON = 0.2, 0.15  # noise over contrast; sharp images have less than 0.1
+_SMOOTHING_PX = 0.8
+
+
+class NoiseFilter:
+    """Smooths images of the cameras of one pair while their noise is large against what they show."""
+
+    def __init__(self) -> None:
+        self._is_smoothing = False
+
+    def filtered(self, left: Image, right: Image | None) -> tuple[Image, Image | None]:
+        """Return the images, smoothed alike if the noise of one of them asks for it.
+
+        Args:
+            left: (height, width), or the image of a single camera.
+            right: (height, width), or None.
+        """
+        images = [image for image in (left, right) if image is not None]
+        least = _MIN_TO_GO_ON if self._is_smoothing else _MIN_TO_SMOOTH
+        self._is_smoothing = any(noise_sigma(image) > least * contrast(image) for image in images)
+        if not self._is_smoothing:
+            return left, right
+        return _smoothed(left), None if right is None else _smoothed(right)
+
+
+def _smoothed(image: Image) -> Image:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTHING_PX), dtype=np.uint8)
+
+
+@kernel
+def contrast(image: Image) -> float:
+    """Compute the standard deviation of grey levels within blocks of 16 pixels, of those with the more contrast."""
+    height, width = image.shape
+    rows, columns, count = height // _BLOCK_PX, width // _BLOCK_PX, (_BLOCK_PX // _BLOCK_STEP) ** 2
+    variances = np.zeros(max(rows * columns, 1))
+    for j in range(rows):
+        for i in range(columns):
+            total = squares = 0
+            for y in range(j * _BLOCK_PX, (j + 1) * _BLOCK_PX, _BLOCK_STEP):
+                for x in range(i * _BLOCK_PX, (i + 1) * _BLOCK_PX, _BLOCK_STEP):
+                    value = int(image[y, x])
+                    total += value
+                    squares += value * value
+            mean = total / count
+            variances[j * columns + i] = squares / count - mean * mean
+    variances.sort()
+    return float(np.sqrt(variances[int(_TEXTURED * (len(variances) - 1))]))
+
+
+@kernel
+def noise_sigma(image: Image) -> float:
+    """Estimate the standard deviation of an image's noise in grey levels, at least that of rounding to whole ones.
+
+    The operator of J. Immerkaer (*Fast noise variance estimation*, CVIU 64(2), 1996) is blind to anything that is
+    linear along rows or columns; the median over the image leaves out most of the remaining texture. Pixels that are
+    black or saturated show no noise and do not count.
+    """
+    height, width = image.shape
+    histogram = np.zeros(_MAX_RESPONSE + 1, dtype=np.int64)
+    count = 0
+    for y in range(1, height - 1, _STEP):
+        for x in range(1, width - 1, _STEP):
+            middle = int(image[y, x])
+            if middle == 0 or middle == 255:
+                continue
+            corners = int(image[y - 1, x - 1]) + int(image[y - 1, x + 1])
+            corners += int(image[y + 1, x - 1]) + int(image[y + 1, x + 1])
+            edges = int(image[y - 1, x]) + int(image[y + 1, x]) + int(image[y, x - 1]) + int(image[y, x + 1])
+            histogram[min(abs(corners - 2 * edges + 4 * middle), _MAX_RESPONSE)] += 1
+            count += 1
+    rounding = float(1.0 / np.sqrt(12.0))
+    below = 0
+    for value in range(_MAX_RESPONSE + 1):
+        if below + histogram[value] > _QUANTILE * count:
+            within = (_QUANTILE * count - below) / histogram[value]
+            return float(max((value - 0.5 + within) / _GAIN, rounding))
+        below += histogram[value]
+    return rounding

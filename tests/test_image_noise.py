@@ -1,0 +1,77 @@
+"""Image noise is measured, and smoothed where it hides what corners look like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from waves import picture, waves
+
+from graphvio import FrameSet, Odometry, open_source
+from graphvio.arrays import AnyArray, Image
+from graphvio.evaluation import evaluate
+from graphvio.frontend.image_noise import NoiseFilter, contrast, noise_sigma
+from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
+
+CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
+X, Y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+
+
+def noisy(image: AnyArray, sigma: float, seed: int) -> Image:
+    white = np.random.default_rng(seed).normal(0.0, sigma, image.shape)
+    return np.asarray(np.clip(np.round(image + white), 0, 255), dtype=np.uint8)
+
+
+def test_noise_sigma_ignores_texture() -> None:
+    flat = np.full(X.shape, 100.0)
+    for sigma in (0.7, 2.0, 6.0):
+        for scene in (flat, flat + 0.2 * X, flat + 40.0 * (X > 150)):
+            assert noise_sigma(noisy(scene, sigma, 1)) == pytest.approx(sigma, rel=0.12)
+        white = sigma * np.random.default_rng(1).standard_normal(flat.shape)
+        assert noise_sigma(picture(waves(0.5 * X, 0.5 * Y) + white / 45.0)) == pytest.approx(sigma, rel=0.5)
+    assert noise_sigma(flat.astype(np.uint8)) == pytest.approx(1.0 / np.sqrt(12.0))  # rounding is noise
+    assert noise_sigma(np.zeros(X.shape, dtype=np.uint8)) > 0.0
+
+
+def test_contrast_is_that_of_the_textured_blocks() -> None:
+    half_checked = np.where((X < 160) & ((X.astype(int) // 2 + Y.astype(int) // 2) % 2 == 0), 140, 100).astype(np.uint8)
+    assert contrast(half_checked) == pytest.approx(20.0)
+    assert contrast(np.full(X.shape, 100, dtype=np.uint8)) == 0.0
+    assert contrast(np.zeros((8, 8), dtype=np.uint8)) == 0.0  # smaller than a block
+
+
+def test_filter_smooths_both_images_while_one_is_noisy_and_leaves_clean_ones_alone() -> None:
+    scene = 128.0 + 45.0 * waves(0.5 * X, 0.5 * Y)
+    texture = contrast(noisy(scene, 0.0, 0))
+    noise_filter = NoiseFilter()
+    for k, share in enumerate([0.1, 0.17, 0.3, 0.17, 0.1, 0.17]):
+        clean, image = noisy(scene, 0.0, k), noisy(scene, share * texture, k)
+        left, right = noise_filter.filtered(clean, image)
+        assert right is not None
+        is_smoothed = k in (2, 3)  # a share of 0.17 stays what it was
+        assert (left is not clean, right is not image) == (is_smoothed, is_smoothed)
+        if is_smoothed:
+            assert np.std(right - scene) < 0.6 * np.std(image - scene)
+            assert np.std(left - scene) < 0.2 * texture
+    assert noise_filter.filtered(clean, None) == (clean, None)
+
+
+@pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
+def test_pair_alone_in_noise() -> None:
+    """Noise of 15 grey levels hides most corners' likeness: unsmoothed, the path is wrong by half a metre."""
+    source = open_source(CLIP)
+    rig = source.rig.without_imu()
+    odometry, estimates = Odometry(rig), []
+    for measurement in open_source(CLIP, rig, to_s=12.0):
+        if isinstance(measurement, FrameSet):
+            left, right = measurement.images[0]
+            seed = measurement.stamp_ns % 2**32
+            images = {0: (noisy(left, 15.0, seed), noisy(right, 15.0, seed + 1))}
+            estimates.append(odometry.process(FrameSet(measurement.stamp_ns, images)))
+    poses = [(each.stamp_ns, each.nav_T_body) for each in (*estimates, *odometry.finish()) if each is not None]
+    assert all(pose is not None for _, pose in poses)
+    assert source.truth is not None
+    estimated = Trajectory(np.array([stamp_ns for stamp_ns, _ in poses]), np.array([pose for _, pose in poses]))
+    assert evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse < 0.015
