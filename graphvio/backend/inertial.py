@@ -11,6 +11,7 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.kernels import kernel, put
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.imu_noise import shown_noise
 from graphvio.measurements.sensors import ImuSample
 
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
@@ -28,6 +29,7 @@ _MIN_LOG_CHANCE = np.log(1e-9)  # of a working axis that repeats its value so of
 _MIN_MOTION = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2
 _KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
 _ROOM = 1024  # samples that the buffer has room for at first
+_NOISE_SAMPLES = 50  # that show the noise of an interval
 
 
 class ImuBuffer:
@@ -89,7 +91,9 @@ class ImuBuffer:
         if np.diff(stamps).max() > self._max_gap_ns:
             return None
         steps_s, means = _steps(stamps - start_ns, self._values[first : last + 1], end_ns - start_ns)
-        return ImuInterval(steps_s, means[:, :3], means[:, 3:])
+        recent = slice(max(min(first, last - _NOISE_SAMPLES), 0), last + 1)
+        noise = shown_noise(self._stamps[recent], self._values[recent], self._max_gap_ns)
+        return ImuInterval(steps_s, means[:, :3], means[:, 3:], noise)
 
     def segment(self, start_ns: int, end_ns: int) -> tuple[ImuInterval, int] | None:
         """Return the longest gapless segment that ends at the newest sample between two instants.

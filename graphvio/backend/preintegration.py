@@ -19,11 +19,20 @@ from graphvio.rig import Imu
 _INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
 
 
-def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
-    """Return gtsam's parameters for nav z up, with the rig's noise densities times a factor."""
+def preintegration_params(
+    imu: Imu, noise_scale: float, shown: Float | None = None
+) -> gtsam.PreintegrationCombinedParams:
+    """Return gtsam's parameters for nav z up.
+
+    Args:
+        imu: its noise densities.
+        noise_scale: factor on these.
+        shown: (2,) white noise densities of gyro and accelerometer that samples show, used where they are larger.
+    """
+    gyro, accel = np.maximum(noise_scale * imu.noise_densities, 0.0 if shown is None else shown)
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
-    params.setGyroscopeCovariance(np.eye(3) * (noise_scale * imu.gyro_noise_density) ** 2)
-    params.setAccelerometerCovariance(np.eye(3) * (noise_scale * imu.accel_noise_density) ** 2)
+    params.setGyroscopeCovariance(np.eye(3) * gyro**2)
+    params.setAccelerometerCovariance(np.eye(3) * accel**2)
     params.setBiasOmegaCovariance(np.eye(3) * (noise_scale * imu.gyro_random_walk) ** 2)
     params.setBiasAccCovariance(np.eye(3) * (noise_scale * imu.accel_random_walk) ** 2)
     params.setIntegrationCovariance(np.eye(3) * (noise_scale * _INTEGRATION_SIGMA) ** 2)

@@ -110,7 +110,7 @@ class Smoother:
             self._link_by_constant_velocity(i, j, motion, dt)
             return state
         bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
-        measurements = preintegrate(interval, self._params, bias)
+        measurements = preintegrate(interval, self._params_of(interval), bias)
         predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
         beyond = before.gravity_nav - level_gravity()  # which gtsam predicts with
         pose = predicted.pose().matrix()
@@ -298,6 +298,14 @@ class Smoother:
             with suppress(*SOLVER_ERRORS):
                 self.optimize()
         return [(stamp, self.pose(stamp)) for stamp in self._stamps]
+
+    def _params_of(self, interval: ImuInterval) -> gtsam.PreintegrationCombinedParams:
+        """Return the parameters by the stated noise or, where that is more, by what the samples show."""
+        assert self._imu is not None
+        noise_scale = self._config.imu_noise_scale
+        if self._params is not None and (interval.noise_densities <= noise_scale * self._imu.noise_densities).all():
+            return self._params
+        return preintegration_params(self._imu, noise_scale, interval.noise_densities)
 
     def _append(self, stamp_ns: int, state: RigState) -> int:
         k = self._index

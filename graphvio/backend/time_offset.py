@@ -57,7 +57,7 @@ class TimeOffsetFilter:
     """
 
     def __init__(self, imu: Imu, noise_scale: float, imu_between: Callable[[int, int], ImuInterval | None]) -> None:
-        self._gyro_variance = (noise_scale * imu.gyro_noise_density) ** 2
+        self._gyro_noise_density = noise_scale * imu.gyro_noise_density
         self._walk_variance = np.array([_WALK_S**2, *3 * [(noise_scale * imu.gyro_random_walk) ** 2]])
         self._imu_between = imu_between
         self._mean = np.zeros(4)
@@ -113,7 +113,8 @@ class TimeOffsetFilter:
         jacobian = np.hstack([by_offset[:, None], by_bias])
         # The rates are not those of the true instants: they change with the angular acceleration.
         change = _ANGULAR_ACCEL_RAD_S2 * self._covariance[0, 0]
-        covariance = covariance + (interval.steps_s.sum() * self._gyro_variance + change**2) * np.eye(3)
+        noise = max(self._gyro_noise_density, float(interval.noise_densities[0]))
+        covariance = covariance + (interval.steps_s.sum() * noise**2 + change**2) * np.eye(3)
         innovation = residual - by_offset * (self._mean[0] - error_s)
         spread = covariance + jacobian @ self._covariance @ jacobian.T
         if not gate_innovation(innovation, spread, _GATE_PROBABILITY).accepted:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,11 +17,14 @@ class ImuInterval:
         steps_s: (N,) durations of the steps.
         angular_velocity: (N, 3) rad/s, body.
         linear_acceleration: (N, 3) m/s^2 specific force, body.
+        noise_densities: (2,) of gyro and accelerometer, as the samples show them (`graphvio.measurements.imu_noise`);
+            zero where that is not known.
     """
 
     steps_s: Float
     angular_velocity: Float
     linear_acceleration: Float
+    noise_densities: Float = field(default_factory=lambda: np.zeros(2))
 
     @property
     def mean_rate(self) -> Float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float, Int
+from graphvio.measurements.imu_noise import shown_noise
 from graphvio.rig import Imu
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.preintegration import Preintegrated, covering_samples, preintegrate
@@ -27,7 +28,7 @@ class SampleBuffer:
     """
 
     def __init__(self, imu: Imu, noise_scale: float, max_gap_ns: int) -> None:
-        self._noise = noise_scale * np.array([imu.gyro_noise_density, imu.accel_noise_density])
+        self._stated_noise = noise_scale * imu.noise_densities
         self._max_gap_ns = max_gap_ns
         self.time_offset_s = 0.0
         self._waiting_ns: list[int] = []
@@ -80,6 +81,12 @@ class SampleBuffer:
             is_offset_known: whether the time offset is taken for known, and stays as it is.
         """
         return InertialSamples(*self._extended(is_offset_known), stamps_ns, self._noise, self._max_gap_ns)
+
+    @property
+    def _noise(self) -> Float:
+        """Noise densities (2,) as stated or, where that is more, as the samples in use show it."""
+        shown: Float = shown_noise(self._stamps_ns, self._readings, self._max_gap_ns)
+        return np.maximum(self._stated_noise, shown)
 
     @property
     def _offset_ns(self) -> int:

@@ -63,6 +63,11 @@ class Imu:
         return round(self.time_offset_s * 1e9)
 
     @property
+    def noise_densities(self) -> Float:
+        """White noise densities (2,) of gyro and accelerometer."""
+        return np.array([self.gyro_noise_density, self.accel_noise_density])
+
+    @property
     def has_matrices(self) -> bool:
         """Whether readings have to be multiplied by a matrix."""
         return self.gyro_matrix != _IDENTITY or self.accel_matrix != _IDENTITY

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.measurements.imu_noise import shown_noise
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.inertial import InertialSamples
@@ -93,10 +94,12 @@ class WindowCollector:
             self._samples.popleft()
         if not self._samples:
             return None
+        stamps = np.array([sample.stamp_ns - self._imu.time_offset_ns for sample in self._samples])
+        values = np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in self._samples])
         return InertialSamples(
-            np.array([sample.stamp_ns - self._imu.time_offset_ns for sample in self._samples]),
-            np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in self._samples]),
+            stamps,
+            values,
             np.array([keyframe.stamp_ns for keyframe in window]),
-            _IMU_NOISE_FACTOR * np.array([self._imu.gyro_noise_density, self._imu.accel_noise_density]),
+            np.maximum(_IMU_NOISE_FACTOR * self._imu.noise_densities, shown_noise(stamps, values, _MAX_IMU_GAP_NS)),
             _MAX_IMU_GAP_NS,
         )
