@@ -20,14 +20,15 @@ _INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integ
 
 
 def preintegration_params(
-    imu: Imu, noise_scale: float, shown: Float | None = None
+    imu: Imu, noise_scale: float, shown: Float | None = None, position_density: float = 0.0
 ) -> gtsam.PreintegrationCombinedParams:
     """Return gtsam's parameters for nav z up.
 
     Args:
         imu: its noise densities.
         noise_scale: factor on these.
-        shown: (2,) white noise densities of gyro and accelerometer that samples show, used where they are larger.
+        shown: (2,) white noise densities of gyro and accelerometer in this interval, used where they are larger.
+        position_density: of white noise of the velocity by which positions are integrated, m/sqrt(s).
     """
     gyro, accel = np.maximum(noise_scale * imu.noise_densities, 0.0 if shown is None else shown)
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
@@ -35,7 +36,7 @@ def preintegration_params(
     params.setAccelerometerCovariance(np.eye(3) * accel**2)
     params.setBiasOmegaCovariance(np.eye(3) * (noise_scale * imu.gyro_random_walk) ** 2)
     params.setBiasAccCovariance(np.eye(3) * (noise_scale * imu.accel_random_walk) ** 2)
-    params.setIntegrationCovariance(np.eye(3) * (noise_scale * _INTEGRATION_SIGMA) ** 2)
+    params.setIntegrationCovariance(np.eye(3) * ((noise_scale * _INTEGRATION_SIGMA) ** 2 + position_density**2))
     return params
 
 

@@ -38,12 +38,16 @@ from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
 _RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
 _POSE_AND_GRAVITY = np.r_[0:6, 15:18]
 _MAX_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
+
+
+_MIN_JITTER_S = 1e-4
 
 
 class Smoother:
@@ -110,7 +114,7 @@ class Smoother:
             self._link_by_constant_velocity(i, j, motion, dt)
             return state
         bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
-        measurements = preintegrate(interval, self._params_of(interval), bias)
+        measurements = preintegrate(interval, self._params_of(interval, before), bias)
         predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
         beyond = before.gravity_nav - level_gravity()  # which gtsam predicts with
         pose = predicted.pose().matrix()
@@ -299,13 +303,23 @@ class Smoother:
                 self.optimize()
         return [(stamp, self.pose(stamp)) for stamp in self._stamps]
 
-    def _params_of(self, interval: ImuInterval) -> gtsam.PreintegrationCombinedParams:
-        """Return the parameters by the stated noise or, where that is more, by what the samples show."""
+    def _params_of(self, interval: ImuInterval, state: RigState) -> gtsam.PreintegrationCombinedParams:
+        """Return the parameters by the stated noise or, where that is more, by what samples and stamps show."""
         assert self._imu is not None
-        noise_scale = self._config.imu_noise_scale
-        if self._params is not None and (interval.noise_densities <= noise_scale * self._imu.noise_densities).all():
+        noise_scale, jitter_s = self._config.imu_noise_scale, interval.stamp_sigma_s
+        usual = noise_scale * self._imu.noise_densities
+        if self._params is not None and jitter_s < _MIN_JITTER_S and (interval.noise_densities <= usual).all():
             return self._params
-        return preintegration_params(self._imu, noise_scale, interval.noise_densities)
+        gyro, accel = np.maximum(usual, interval.noise_densities)
+        # By an interval that is longer than the stamps say, the rig turns, accelerates and moves on.
+        dt = interval.steps_s.sum()
+        longer_s2 = 2.0 * jitter_s**2
+        turn2 = longer_s2 * np.sum((interval.mean_rate - state.gyro_bias) ** 2)
+        moved2 = longer_s2 * np.sum(state.velocity_nav**2)
+        accel_m_s2 = np.linalg.norm(interval.mean_force) - GRAVITY_M_S2
+        faster2 = longer_s2 * accel_m_s2**2
+        shown = np.sqrt([gyro**2 + turn2 / dt, accel**2 + faster2 / dt])
+        return preintegration_params(self._imu, noise_scale, shown, np.sqrt(moved2 / dt))
 
     def _append(self, stamp_ns: int, state: RigState) -> int:
         k = self._index

@@ -115,6 +115,7 @@ class TimeOffsetFilter:
         change = _ANGULAR_ACCEL_RAD_S2 * self._covariance[0, 0]
         noise = max(self._gyro_noise_density, float(interval.noise_densities[0]))
         covariance = covariance + (interval.steps_s.sum() * noise**2 + change**2) * np.eye(3)
+        covariance += interval.stamp_sigma_s**2 * rates.T @ rates
         innovation = residual - by_offset * (self._mean[0] - error_s)
         spread = covariance + jacobian @ self._covariance @ jacobian.T
         if not gate_innovation(innovation, spread, _GATE_PROBABILITY).accepted:

@@ -19,12 +19,14 @@ class ImuInterval:
         linear_acceleration: (N, 3) m/s^2 specific force, body.
         noise_densities: (2,) of gyro and accelerometer, as the samples show them (`graphvio.measurements.imu_noise`);
             zero where that is not known.
+        stamp_sigma_s: standard deviation of both instants, as of framesets that are stamped when they arrive.
     """
 
     steps_s: Float
     angular_velocity: Float
     linear_acceleration: Float
     noise_densities: Float = field(default_factory=lambda: np.zeros(2))
+    stamp_sigma_s: float = 0.0
 
     @property
     def mean_rate(self) -> Float:

@@ -120,6 +120,7 @@ class PairsCalibration:
             calibration.start_window()
         views = views_at(self._frontend, stamp_ns)
         pose = estimator.state().nav_T_body if self._smoother is None else self._smoother.pose_by_vision()
+        calibration.note_stamps(self._synchroniser.stamp_sigma_s)
         calibration.add_frameset(stamp_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:

@@ -14,6 +14,7 @@ from graphvio.config import Config
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import FrameSet, ImuSample
+from graphvio.odometry.stamp_jitter import StampJitter
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_correction import ImuCorrection
 
@@ -59,6 +60,7 @@ class Synchroniser:
         self._imu = ImuBuffer(config.timing.max_imu_gap_ms)
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
+        self._jitter = StampJitter()
         self._sample_jumps: JumpGuard[ImuSample] = JumpGuard(EventKind.IMU_FUTURE_STAMP, report)
         self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
 
@@ -121,7 +123,7 @@ class Synchroniser:
         """Return the oldest held frameset if it is due; the first one waits for IMU samples to initialise from."""
         if not self._held or not self._is_due(self._held[0], initialised):
             return None
-        return self._held.popleft()
+        return self._taken()
 
     @property
     def held_ns(self) -> int | None:
@@ -130,7 +132,12 @@ class Synchroniser:
 
     def next_held(self) -> FrameSet | None:
         """Return the oldest held frameset, due or not, or None."""
-        return self._held.popleft() if self._held else None
+        return self._taken() if self._held else None
+
+    def _taken(self) -> FrameSet:
+        frameset = self._held.popleft()
+        self._jitter.add(frameset.stamp_ns, min(frameset.images, default=0))
+        return frameset
 
     def finish(self) -> None:
         """Leave out what was not confirmed, as no measurement follows."""
@@ -140,7 +147,9 @@ class Synchroniser:
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Return the IMU between two framesets' stamps, or None where it does not cover them."""
         interval = self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
-        return None if interval is None else self.imu_correction.applied_to(interval)
+        if interval is None:
+            return None
+        return self.imu_correction.applied_to(replace(interval, stamp_sigma_s=self.stamp_sigma_s))
 
     def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
         """Return the IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
@@ -184,6 +193,11 @@ class Synchroniser:
     def shift_imu(self, seconds: float) -> None:
         """Add a correction, seconds, to the offset of the IMU's stamps from the framesets'."""
         self._offset_ns += round(seconds * 1e9)
+
+    @property
+    def stamp_sigma_s(self) -> float:
+        """Standard deviation of the framesets' stamps."""
+        return self._jitter.sigma_s
 
     @property
     def time_offset_s(self) -> float:

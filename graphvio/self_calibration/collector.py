@@ -46,10 +46,12 @@ class WindowCollector:
 
     Attributes:
         keyframes: of the window that grows.
+        stamp_sigma_s: standard deviation of the framesets' stamps.
     """
 
     def __init__(self, rig: Rig) -> None:
         self.keyframes: list[Keyframe] = []
+        self.stamp_sigma_s = 0.0
         self._imu = rig.imu
         self._samples: deque[ImuSample] = deque()
         self._last: Keyframe | None = None
@@ -96,10 +98,31 @@ class WindowCollector:
             return None
         stamps = np.array([sample.stamp_ns - self._imu.time_offset_ns for sample in self._samples])
         values = np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in self._samples])
+        noise = np.maximum(_IMU_NOISE_FACTOR * self._imu.noise_densities, shown_noise(stamps, values, _MAX_IMU_GAP_NS))
         return InertialSamples(
             stamps,
             values,
             np.array([keyframe.stamp_ns for keyframe in window]),
-            np.maximum(_IMU_NOISE_FACTOR * self._imu.noise_densities, shown_noise(stamps, values, _MAX_IMU_GAP_NS)),
+            np.hypot(noise, _noise_of_stamps(window, values[:, :3], self.stamp_sigma_s)),
             _MAX_IMU_GAP_NS,
         )
+
+
+def _noise_of_stamps(window: tuple[Keyframe, ...], rates: Float, sigma_s: float) -> Float:
+    """Return white noise densities (2,) of gyro and accelerometer that err as much as the stamps of keyframes do.
+
+    Args:
+        window: K keyframes.
+        rates: (N, 3) angular velocities over it.
+        sigma_s: standard deviation of the stamps.
+    """
+    if sigma_s == 0.0 or len(window) < 2:
+        return np.zeros(2)
+    intervals_s = 1e-9 * np.diff([keyframe.stamp_ns for keyframe in window])
+    steps_m = np.diff([keyframe.odom_T_body[:3, 3] for keyframe in window], axis=0)
+    dt, rate2 = float(np.median(intervals_s)), np.mean(np.sum(rates**2, axis=1))
+    speed2 = np.mean(np.sum(steps_m**2, axis=1) / intervals_s**2)
+    # By an interval that is longer than its stamps say, the rig turns and moves on; white noise of the accelerometer
+    # moves it by a third of its variance times the cube of the interval.
+    longer2 = 2.0 * sigma_s**2
+    return np.asarray(np.sqrt([longer2 * rate2 / dt, 3.0 * longer2 * speed2 / dt**3]))

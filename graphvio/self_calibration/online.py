@@ -135,6 +135,10 @@ class SelfCalibration:
         """Take an IMU sample as it was measured, in time order."""
         self._collector.add_sample(sample)
 
+    def note_stamps(self, sigma_s: float) -> None:
+        """Take the standard deviation of the framesets' stamps, seconds, as it is known now."""
+        self._collector.stamp_sigma_s = sigma_s
+
     def add_frameset(
         self,
         stamp_ns: int,
