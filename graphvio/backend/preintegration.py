@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.states import RigState
 from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel
 from graphvio.measurements.imu_interval import ImuInterval
@@ -17,26 +18,47 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
+_MIN_STAMP_SIGMA_S = 1e-4  # of stamps that jitter
 
 
-def preintegration_params(
-    imu: Imu, noise_scale: float, shown: Float | None = None, position_density: float = 0.0
-) -> gtsam.PreintegrationCombinedParams:
-    """Return gtsam's parameters for nav z up.
-
-    Args:
-        imu: its noise densities.
-        noise_scale: factor on these.
-        shown: (2,) white noise densities of gyro and accelerometer in this interval, used where they are larger.
-        position_density: of white noise of the velocity by which positions are integrated, m/sqrt(s).
-    """
-    gyro, accel = np.maximum(noise_scale * imu.noise_densities, 0.0 if shown is None else shown)
+def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
+    """Return gtsam's parameters for nav z up, with the rig's noise densities times a factor."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
-    params.setGyroscopeCovariance(np.eye(3) * gyro**2)
-    params.setAccelerometerCovariance(np.eye(3) * accel**2)
+    params.setGyroscopeCovariance(np.eye(3) * (noise_scale * imu.gyro_noise_density) ** 2)
+    params.setAccelerometerCovariance(np.eye(3) * (noise_scale * imu.accel_noise_density) ** 2)
     params.setBiasOmegaCovariance(np.eye(3) * (noise_scale * imu.gyro_random_walk) ** 2)
     params.setBiasAccCovariance(np.eye(3) * (noise_scale * imu.accel_random_walk) ** 2)
-    params.setIntegrationCovariance(np.eye(3) * ((noise_scale * _INTEGRATION_SIGMA) ** 2 + position_density**2))
+    params.setIntegrationCovariance(np.eye(3) * (noise_scale * _INTEGRATION_SIGMA) ** 2)
+    return params
+
+
+def is_as_stated(interval: ImuInterval, imu: Imu, noise_scale: float) -> bool:
+    """Return whether samples show no more than the stated noise, and the stamps of framesets do not jitter."""
+    is_more = interval.noise_densities > noise_scale * imu.noise_densities
+    return interval.stamp_sigma_s < _MIN_STAMP_SIGMA_S and not is_more.any()
+
+
+def interval_params(
+    interval: ImuInterval, imu: Imu, noise_scale: float, state: RigState
+) -> gtsam.PreintegrationCombinedParams:
+    """Return gtsam's parameters for an interval, by the noise that its samples show and the jitter of its stamps.
+
+    Args:
+        interval: to be preintegrated.
+        imu: the rig's.
+        noise_scale: factor on its noise densities, which hold where the samples show less.
+        state: at the interval's beginning.
+    """
+    params, dt = preintegration_params(imu, noise_scale), float(interval.steps_s.sum())
+    gyro, accel = np.maximum(noise_scale * imu.noise_densities, interval.noise_densities)
+    # In an interval that is longer than the stamps say, the rig turns, speeds up and moves on; as white noise.
+    longer2 = 2.0 * interval.stamp_sigma_s**2 / dt
+    turn2 = longer2 * float(np.sum((interval.mean_rate - state.gyro_bias) ** 2))
+    faster2 = longer2 * float((np.linalg.norm(interval.mean_force) - GRAVITY_M_S2) ** 2)
+    moved2 = longer2 * float(np.sum(state.velocity_nav**2))
+    params.setGyroscopeCovariance(np.eye(3) * (gyro**2 + turn2))
+    params.setAccelerometerCovariance(np.eye(3) * (accel**2 + faster2))
+    params.setIntegrationCovariance(np.eye(3) * ((noise_scale * _INTEGRATION_SIGMA) ** 2 + moved2))
     return params
 
 

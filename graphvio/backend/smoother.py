@@ -29,7 +29,7 @@ from graphvio.backend.factors import (
 )
 from graphvio.backend.gating import excess, gate_innovation, gate_motion, relative_covariance
 from graphvio.backend.noise import gaussian, robust
-from graphvio.backend.preintegration import preintegrate, preintegration_params
+from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity, tilt_covariance
 from graphvio.backend.window import SOLVER_ERRORS, Window
@@ -38,16 +38,12 @@ from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
 _RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
 _POSE_AND_GRAVITY = np.r_[0:6, 15:18]
 _MAX_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
-
-
-_MIN_JITTER_S = 1e-4
 
 
 class Smoother:
@@ -107,14 +103,17 @@ class Smoother:
         i = self._index_of[self.latest_ns]
         dt = (stamp_ns - self.latest_ns) * 1e-9
         before = self.state()
-        if interval is None or self._params is None:
+        if interval is None or self._imu is None or self._params is None:
             motion = se3_exp(self._previous_motion * dt)
             state = replace(before, nav_T_body=before.nav_T_body @ motion)
             j = self._append(stamp_ns, state)
             self._link_by_constant_velocity(i, j, motion, dt)
             return state
         bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
-        measurements = preintegrate(interval, self._params_of(interval, before), bias)
+        params, noise_scale = self._params, self._config.imu_noise_scale
+        if not is_as_stated(interval, self._imu, noise_scale):
+            params = interval_params(interval, self._imu, noise_scale, before)
+        measurements = preintegrate(interval, params, bias)
         predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
         beyond = before.gravity_nav - level_gravity()  # which gtsam predicts with
         pose = predicted.pose().matrix()
@@ -302,24 +301,6 @@ class Smoother:
             with suppress(*SOLVER_ERRORS):
                 self.optimize()
         return [(stamp, self.pose(stamp)) for stamp in self._stamps]
-
-    def _params_of(self, interval: ImuInterval, state: RigState) -> gtsam.PreintegrationCombinedParams:
-        """Return the parameters by the stated noise or, where that is more, by what samples and stamps show."""
-        assert self._imu is not None
-        noise_scale, jitter_s = self._config.imu_noise_scale, interval.stamp_sigma_s
-        usual = noise_scale * self._imu.noise_densities
-        if self._params is not None and jitter_s < _MIN_JITTER_S and (interval.noise_densities <= usual).all():
-            return self._params
-        gyro, accel = np.maximum(usual, interval.noise_densities)
-        # By an interval that is longer than the stamps say, the rig turns, accelerates and moves on.
-        dt = interval.steps_s.sum()
-        longer_s2 = 2.0 * jitter_s**2
-        turn2 = longer_s2 * np.sum((interval.mean_rate - state.gyro_bias) ** 2)
-        moved2 = longer_s2 * np.sum(state.velocity_nav**2)
-        accel_m_s2 = np.linalg.norm(interval.mean_force) - GRAVITY_M_S2
-        faster2 = longer_s2 * accel_m_s2**2
-        shown = np.sqrt([gyro**2 + turn2 / dt, accel**2 + faster2 / dt])
-        return preintegration_params(self._imu, noise_scale, shown, np.sqrt(moved2 / dt))
 
     def _append(self, stamp_ns: int, state: RigState) -> int:
         k = self._index
