@@ -48,7 +48,7 @@ def test_interval_has_the_noise_of_samples_before_it() -> None:
     values = moving_samples(stamps, 200.0)
     for stamp_ns, value in zip(stamps.tolist(), values, strict=True):
         assert buffer.add(ImuSample(stamp_ns, value[:3], value[3:])) == ""
-    buffer.discard_before(900_000_000)
+    buffer.discard_before(650_000_000)
     interval = buffer.interval(900_000_000, 950_000_000)
     assert interval is not None
     np.testing.assert_allclose(interval.noise_densities, DENSITIES, rtol=0.25)

@@ -5,12 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
-from graphvio import FrameSet, Odometry, open_source
+from graphvio import FrameSet, Imu, Odometry, open_source
+from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
+from graphvio.backend.states import RigState
 from graphvio.evaluation import evaluate
+from graphvio.geometry import so3_log
 from graphvio.measurements.events import EventKind
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import GRAVITY_M_S2 as G
 from graphvio.odometry.stamp_jitter import StampJitter
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -52,6 +58,37 @@ def test_jitter_is_estimated(true_ms: float, share_missing: float) -> None:
         shown.append(sigma_ms(stamps[rng.random(60) >= share_missing]))
     assert np.median(shown) == pytest.approx(true_ms, rel=0.15)
     assert np.quantile(shown, 0.05) > 0.6 * true_ms
+
+
+def test_covariance_of_an_interval_covers_what_its_stamps_err_by() -> None:
+    """A rig that turns at 1 rad/s and moves at 2 m/s, integrated over intervals whose ends err by 3 ms."""
+    imu, rate, velocity, force = Imu(), np.array([0.0, 0.0, 1.0]), np.array([2.0, 0.0, 0.0]), np.array([0.0, 0.0, G])
+    state = RigState(np.eye(4), velocity, np.zeros(3), np.zeros(3))
+
+    def integrated(duration_s: float, sigma_s: float) -> gtsam.PreintegratedCombinedMeasurements:
+        steps = np.full(10, duration_s / 10)
+        interval = ImuInterval(steps, np.tile(rate, (10, 1)), np.tile(force, (10, 1)), stamp_sigma_s=sigma_s)
+        assert is_as_stated(interval, imu, 3.0) == (sigma_s == 0.0)
+        return preintegrate(interval, interval_params(interval, imu, 3.0, state), gtsam.imuBias.ConstantBias())
+
+    ends = 0.003 * np.random.default_rng(4).standard_normal((500, 2))
+    turns, moves = [], []
+    for first, last in ends:
+        predicted = integrated(0.05 + last - first, 0.0).predict(
+            gtsam.NavState(gtsam.Pose3(np.eye(4)), velocity), gtsam.imuBias.ConstantBias()
+        )
+        turns.append(so3_log(predicted.pose().matrix()[:3, :3].copy())[2])
+        moves.append(predicted.position()[0])
+    covariance = integrated(0.05, 0.003).preintMeasCov()
+    assert np.sqrt(covariance[2, 2]) == pytest.approx(np.std(turns), rel=0.1)
+    assert np.sqrt(covariance[3, 3]) == pytest.approx(np.std(moves), rel=0.1)
+    as_stated = integrated(0.05, 0.0).preintMeasCov()
+    usual = preintegrate(
+        ImuInterval(np.full(10, 0.005), np.tile(rate, (10, 1)), np.tile(force, (10, 1))),
+        preintegration_params(imu, 3.0),
+        gtsam.imuBias.ConstantBias(),
+    )
+    np.testing.assert_array_equal(as_stated, usual.preintMeasCov())
 
 
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")

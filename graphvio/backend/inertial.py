@@ -91,7 +91,7 @@ class ImuBuffer:
         if np.diff(stamps).max() > self._max_gap_ns:
             return None
         steps_s, means = _steps(stamps - start_ns, self._values[first : last + 1], end_ns - start_ns)
-        recent = slice(max(min(first, last - _NOISE_SAMPLES), 0), last + 1)
+        recent = slice(max(min(first, last - _NOISE_SAMPLES), self._first), last + 1)
         noise = shown_noise(self._stamps[recent], self._values[recent], self._max_gap_ns)
         return ImuInterval(steps_s, means[:, :3], means[:, 3:], noise)
 

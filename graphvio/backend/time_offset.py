@@ -109,13 +109,14 @@ class TimeOffsetFilter:
         by_gyro, by_bias = integrated_rates(interval.steps_s, interval.angular_velocity - self._mean[1:])
         residual = so3_log(np.ascontiguousarray(by_gyro.T @ start_R_end))
         rates = interval.angular_velocity[[0, -1]] - self._mean[1:]
-        by_offset = rates[1] - by_gyro.T @ rates[0]
+        by_stamps = np.array([rates[1], -by_gyro.T @ rates[0]])
+        by_offset = by_stamps.sum(axis=0)
         jacobian = np.hstack([by_offset[:, None], by_bias])
         # The rates are not those of the true instants: they change with the angular acceleration.
         change = _ANGULAR_ACCEL_RAD_S2 * self._covariance[0, 0]
         noise = max(self._gyro_noise_density, float(interval.noise_densities[0]))
         covariance = covariance + (interval.steps_s.sum() * noise**2 + change**2) * np.eye(3)
-        covariance += interval.stamp_sigma_s**2 * rates.T @ rates
+        covariance += interval.stamp_sigma_s**2 * by_stamps.T @ by_stamps
         innovation = residual - by_offset * (self._mean[0] - error_s)
         spread = covariance + jacobian @ self._covariance @ jacobian.T
         if not gate_innovation(innovation, spread, _GATE_PROBABILITY).accepted:

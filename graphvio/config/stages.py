@@ -150,7 +150,7 @@ class SmootherConfig(Stage):
     """Time from one reset of the position's covariance to the next."""
     imu_noise_scale: float = 3.0
     """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate: real flights
-    need it for a consistent covariance. Where samples show more noise than that, theirs is used."""
+    need it for a consistent covariance. Online, where samples show more noise than that, theirs is used."""
     motion_accel_sigma_m_s2: float = 5.0
     """Without an IMU: standard deviation of the acceleration, eq. (11)."""
     motion_angular_accel_sigma_rad_s2: float = 10.0

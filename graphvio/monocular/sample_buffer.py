@@ -28,7 +28,7 @@ class SampleBuffer:
     """
 
     def __init__(self, imu: Imu, noise_scale: float, max_gap_ns: int) -> None:
-        self._stated_noise = noise_scale * imu.noise_densities
+        self._stated_noise = self._noise = noise_scale * imu.noise_densities
         self._max_gap_ns = max_gap_ns
         self.time_offset_s = 0.0
         self._waiting_ns: list[int] = []
@@ -55,6 +55,7 @@ class SampleBuffer:
         end = int(np.searchsorted(stamps, until_ns + self._offset_ns)) + 1
         self._waiting_ns, self._waiting = stamps[end:].tolist(), list(readings[end:])
         self._stamps_ns, self._readings = stamps[first:end], readings[first:end]
+        self._noise = np.maximum(self._stated_noise, shown_noise(self._stamps_ns, self._readings, self._max_gap_ns))
 
     def reaches(self, stamp_ns: int) -> bool:
         """Return whether a sample in use is as late as a stamp, or later."""
@@ -81,12 +82,6 @@ class SampleBuffer:
             is_offset_known: whether the time offset is taken for known, and stays as it is.
         """
         return InertialSamples(*self._extended(is_offset_known), stamps_ns, self._noise, self._max_gap_ns)
-
-    @property
-    def _noise(self) -> Float:
-        """Noise densities (2,) as stated or, where that is more, as the samples in use show it."""
-        shown: Float = shown_noise(self._stamps_ns, self._readings, self._max_gap_ns)
-        return np.maximum(self._stated_noise, shown)
 
     @property
     def _offset_ns(self) -> int:
