@@ -197,6 +197,7 @@ def fly(
     on_keyframe: Callable[[float, MonocularEstimator, Tracks], None] | None = None,
     seed: int = 5,
     late: tuple[float, float] = (0.0, 0.0),
+    missing: tuple[float, float] = (0.0, 0.0),
     mismatched: float = 0.0,
     believed: Rig | None = None,
     config: Config | None = None,
@@ -205,8 +206,8 @@ def fly(
 ) -> Flown:
     """Run the estimator alone, on perfect associations; with every third frameset a keyframe.
 
-    IMU samples of the time between ``late`` come at its end, and all of them are stamped ``offset_ms``
-    late; the first one is stamped ``first_sample_ms``.
+    IMU samples of the time between ``late`` come at its end, those of the time between ``missing`` do not come, and
+    all of them are stamped ``offset_ms`` late; the first one is stamped ``first_sample_ms``.
     ``mismatched`` is that of `Tracks`; ``believed`` is the rig that the estimator is given.
     """
     shares, rig = rig is not None, rig or single_rig()
@@ -228,7 +229,9 @@ def fly(
         stamp_ns = k * FRAME_NS
         while next_ns <= stamp_ns + 2 * IMU_NS and not late[0] <= stamp_ns * 1e-9 < late[1]:
             taken_s = (next_ns - offset_ms * 1_000_000) * 1e-9
-            estimator.add_sample(next_ns, flight.reading(taken_s) + noise * rng.normal(size=6))
+            reading = flight.reading(taken_s) + noise * rng.normal(size=6)
+            if not missing[0] <= taken_s < missing[1]:
+                estimator.add_sample(next_ns, reading)
             next_ns += IMU_NS
         t = stamp_ns * 1e-9
         is_still = before is not None and bool(np.abs(flight.pose(t) - before).max() < 1e-9)
@@ -336,7 +339,7 @@ def problem(n_keyframes: int = 5, is_exact: bool = False, shares: bool = False, 
     sample_ns = np.arange(-20_000_000, stamps[-1] + 20_000_000, IMU_NS)
     noise = np.array([rig.imu.gyro_noise_density, rig.imu.accel_noise_density])
     readings = np.array([flight.reading(ns * 1e-9) for ns in sample_ns])
-    samples = InertialSamples(sample_ns, readings, stamps, noise, 50_000_000)
+    samples = InertialSamples(sample_ns, readings, stamps, noise, 50_000_000, np.ones((len(sample_ns), 2)))
     velocity = np.array([(flight.position(t + 1e-4) - flight.position(t - 1e-4)) / 2e-4 for t in times])
     poses = np.array([flight.pose(t) for t in times])
     gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
@@ -696,15 +699,19 @@ def test_estimator_without_points_coasts_and_goes_on() -> None:
 # ------------------------------------------------------------------ rigs and commands
 
 
-def test_estimator_awaits_late_imu_samples() -> None:
-    flown = fly(moving(), 5.0, late=(3.0, 3.3))
-    error_m, _ = aligned(flown)
-    assert [k for k, status in enumerate(flown.statuses) if status is Status.LOST] == [60, 61, 62, 63, 64, 65]
-    assert flown.statuses[-1] is Status.TRACKING
-    assert flown.estimator.epoch == 0
-    assert error_m < 0.02
-    lost = fly(moving(), 5.0, late=(2.5, 4.0))
+def test_estimator_bridges_late_imu_samples_and_missing_ones() -> None:
+    """A step's noise is that of its length, so poses go on, and the scale with them."""
+    for flown in (fly(moving(), 5.0, late=(3.0, 3.3)), fly(moving(), 7.0, missing=(3.0, 5.0))):
+        error_m, scale = aligned(flown)
+        after = flown.statuses[flown.statuses.index(Status.TRACKING) :]
+        assert set(after) == {Status.TRACKING}
+        assert flown.estimator.epoch == 0
+        assert error_m < 0.01
+        assert abs(scale - 1.0) < 0.01
+    lost = fly(moving(), 9.0, missing=(2.0, 7.5))
     assert lost.estimator.epoch == 1
+    before = lost.stamps_s[lost.stamps_s < 8.0]
+    assert before[-1] == pytest.approx(6.95)  # until 5 s after the newest sample
 
 
 def test_rig_of_single_cameras_without_an_imu_names_camera_and_remedy() -> None:

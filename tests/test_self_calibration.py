@@ -496,6 +496,7 @@ def test_solve_late_clock_does_not_drop_intervals_that_the_samples_cover() -> No
         np.array([keyframe.stamp_ns for keyframe in keyframes]),
         np.array([1e-4, 1e-3]),
         50_000_000,
+        np.ones((len(seen), 2)),
     )
     poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
     tracks, landmarks = choose_tracks(keyframes, poses, nominal, 150)

@@ -174,6 +174,25 @@ def test_preintegrate_perfect_imu_is_as_by_gtsam() -> None:
         np.testing.assert_allclose(ours.jacobian[:, index], numeric, atol=1e-3 * np.abs(numeric).max())
 
 
+def test_preintegrate_noise_factors_enlarge_the_variance_of_their_steps() -> None:
+    times = np.arange(2.0, 3.0, 1.0 / IMU.rate_hz)
+    stamps, readings = ns(times), measured("room", times, PERFECT)
+    start_ns, middle_ns, end_ns = ns(np.array([2.25, 2.5, 2.75])).tolist()
+
+    def covariance(until_ns: int, densities: Float, factors: Float) -> Float:
+        return preintegrate(stamps, readings, start_ns, until_ns, PERFECT, densities, GAP_NS, factors).covariance
+
+    ones, larger = np.ones((len(times), 2)), np.tile([9.0, 4.0], (len(times), 1))
+    by_densities = covariance(end_ns, np.array([3.0, 2.0]) * DENSITIES, ones)
+    np.testing.assert_allclose(covariance(end_ns, DENSITIES, larger), by_densities, rtol=1e-9, atol=1e-30)
+    later = np.where(stamps[:, None] >= middle_ns, larger, 1.0)
+    np.testing.assert_array_equal(covariance(middle_ns, DENSITIES, later), covariance(middle_ns, DENSITIES, ones))
+    sigmas2 = [np.diag(covariance(end_ns, DENSITIES, factors)) for factors in (ones, later, larger)]
+    assert (sigmas2[0] < sigmas2[1]).all()
+    assert (sigmas2[1] < sigmas2[2]).all()
+    np.testing.assert_allclose(sigmas2[1][:3], 5.0 * sigmas2[0][:3])  # half of the time by 1, half by 9
+
+
 def test_preintegrate_samples_that_do_not_cover_the_interval_are_refused() -> None:
     times = np.arange(2.0, 3.0, 1.0 / IMU.rate_hz)
     kept = (times < 2.5) | (times > 2.56)
@@ -248,7 +267,7 @@ def small_window() -> tuple[InertialSamples, InertialStates]:
     times, keyframes = np.arange(2.0, 4.0, 1.0 / IMU.rate_hz), np.array([2.5, 2.75, 3.05, 3.3])
     readings = measured("room", times, random_parameters(9))
     readings = readings + 1e-2 * np.random.default_rng(0).standard_normal(readings.shape)
-    samples = InertialSamples(ns(times), readings, ns(keyframes), DENSITIES, GAP_NS)
+    samples = InertialSamples(ns(times), readings, ns(keyframes), DENSITIES, GAP_NS, np.ones((len(times), 2)))
     return samples, true_states("room", keyframes, random_parameters(10))
 
 
@@ -307,7 +326,8 @@ def recover(seed: int) -> Recovered:
     times = np.arange(WINDOW_S[0] - 0.1, WINDOW_S[1] + 0.1, 1.0 / IMU.rate_hz)
     noise = np.repeat(DENSITIES, 3) * np.sqrt(IMU.rate_hz) * rng.standard_normal((len(times), 6))
     keyframes = np.arange(WINDOW_S[0], WINDOW_S[1] + 1e-6, KEYFRAME_S)
-    samples = InertialSamples(ns(times), measured("room", times, truth) + noise, ns(keyframes), DENSITIES, GAP_NS)
+    readings = measured("room", times, truth) + noise
+    samples = InertialSamples(ns(times), readings, ns(keyframes), DENSITIES, GAP_NS, np.ones((len(times), 2)))
     exact = true_states("room", keyframes, truth)
     n = len(keyframes)
     off = np.zeros(9 * n + 3 + PARAMETERS)

@@ -7,6 +7,7 @@ the scale. Until an `Initialiser` knows it there is no pose.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -33,7 +34,6 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 
 _MAX_CONTRADICTION_NS = 1_000_000_000
-_MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
 _REPORT_AFTER_NS = 5_000_000_000
 _TURNS_OTHERWISE = "the IMU turns otherwise than the cameras"
@@ -74,7 +74,6 @@ class MonocularEstimator:
         self._is_stationary = False
         self._tracked_sigma_m = 0.0
         self._contradicted_since_ns: int | None = None
-        self._awaits_imu = False
         self._rate: Float | None = None
 
     # ------------------------------------------------------------------ what is known
@@ -185,18 +184,13 @@ class MonocularEstimator:
                 self._trust.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
-        """Add a state by the IMU: late samples are awaited for a second, and where some are missing, the epoch ends."""
+        """Add a state by the IMU; where it has not come for a second, the epoch ends."""
         self.gate_results = {}
         self._rate = None
         window, before_ns = self._window, self._latest_ns
         self._samples.collect(self._oldest_needed_ns(stamp_ns), stamp_ns)
-        is_covered = self._samples.covers(before_ns, stamp_ns)
-        is_late = not is_covered and not self._samples.reaches(stamp_ns)
-        self._awaits_imu = is_late and window is not None and stamp_ns - before_ns < _MAX_AWAITED_NS
-        if self._awaits_imu:
-            return False
         self._latest_ns = stamp_ns
-        if not is_covered:
+        if not self._samples.covers(before_ns, stamp_ns, bridges=window is not None):
             self._lose(stamp_ns, "the IMU does not cover the step to this frameset", is_sound=True)
             return False
         if window is None:
@@ -226,8 +220,6 @@ class MonocularEstimator:
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
         """Solve the window, or look for the scale."""
         is_keyframe = stamp_ns in keep
-        if self._awaits_imu:
-            return StateUpdate(Status.LOST)  # there is no state at this frameset
         if self._window is None:
             return self._initialising(stamp_ns, is_keyframe)
         try:
@@ -365,12 +357,12 @@ class MonocularEstimator:
         self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
 
     def _new_samples(self) -> SampleBuffer:
-        imu, config = self._rig.imu, self._config
-        assert imu is not None
-        return SampleBuffer(imu, config.smoother.imu_noise_scale, round(config.timing.max_imu_gap_ms * 1e6))
+        assert self._rig.imu is not None
+        return SampleBuffer(self._rig.imu, self._config)
 
     def _new_initialiser(self, doubts_file: bool = True) -> Initialiser:
-        return Initialiser(self._cameras, self._calibration, self._samples.between, FIRST_SIGMA_PX, doubts_file)
+        samples_of = partial(self._samples.between, bridges=False)
+        return Initialiser(self._cameras, self._calibration, samples_of, FIRST_SIGMA_PX, doubts_file)
 
     def _oldest_needed_ns(self, stamp_ns: int) -> int:
         """Return the stamp from which on IMU samples are needed at a frameset."""

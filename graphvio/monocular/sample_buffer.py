@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Bool, Float, Int
+from graphvio.config import Config
 from graphvio.measurements.imu_noise import shown_noise
 from graphvio.rig import Imu
 from graphvio.self_calibration.inertial import InertialSamples
@@ -13,23 +14,28 @@ from graphvio.self_calibration.preintegration import Preintegrated, covering_sam
 _MARGIN_NS = 100_000_000
 MAX_TIME_OFFSET_NS = 30_000_000
 """By which the time offset of a rig file may be wrong."""
+_MAX_BRIDGED_NS = 5_000_000_000
 
 
 class SampleBuffer:
     """Keeps the samples between the oldest state that is of use and the newest one.
 
+    Where samples are missing for up to a second, readings are interpolated, or the newest one is held, and their noise
+    is that of a rig that moves as it likes: the cameras carry the scale on.
+
     Args:
         imu: Of the rig.
-        noise_scale: Factor on its stated white noise.
-        max_gap_ns: Between samples of one interval.
+        config: Says what a gap is, the factor on the IMU's stated noise, and how a rig may move that is not measured.
 
     Attributes:
         time_offset_s: Of the samples' stamps from those of the framesets, as it is estimated.
     """
 
-    def __init__(self, imu: Imu, noise_scale: float, max_gap_ns: int) -> None:
-        self._stated_noise = self._noise = noise_scale * imu.noise_densities
-        self._max_gap_ns = max_gap_ns
+    def __init__(self, imu: Imu, config: Config) -> None:
+        smoother = config.smoother
+        self._stated_noise = self._noise = smoother.imu_noise_scale * imu.noise_densities
+        self._unmeasured = np.array([smoother.motion_angular_accel_sigma_rad_s2, smoother.motion_accel_sigma_m_s2])
+        self._max_gap_ns = round(config.timing.max_imu_gap_ms * 1e6)
         self.time_offset_s = 0.0
         self._waiting_ns: list[int] = []
         self._waiting: list[Float] = []
@@ -57,14 +63,10 @@ class SampleBuffer:
         self._stamps_ns, self._readings = stamps[first:end], readings[first:end]
         self._noise = np.maximum(self._stated_noise, shown_noise(self._stamps_ns, self._readings, self._max_gap_ns))
 
-    def reaches(self, stamp_ns: int) -> bool:
-        """Return whether a sample in use is as late as a stamp, or later."""
-        return bool((self._stamps_ns[-1:] >= stamp_ns).any())
-
-    def covers(self, start_ns: int, end_ns: int) -> bool:
-        """Return whether the samples in use have no gap between two stamps."""
-        stamps, _ = self._extended()
-        return bool(covering_samples(stamps, start_ns, end_ns, self.time_offset_s, self._max_gap_ns)[1] >= 0)
+    def covers(self, start_ns: int, end_ns: int, bridges: bool = True) -> bool:
+        """Return whether there are samples between two stamps, but for what can be bridged."""
+        samples = self.between(np.array([start_ns, end_ns]), is_offset_known=True, bridges=bridges)
+        return covering_samples(samples.stamps_ns, start_ns, end_ns, self.time_offset_s, samples.max_gap_ns)[1] >= 0
 
     def preintegrated(self, start_ns: int, end_ns: int, parameters: Float) -> Preintegrated:
         """Integrate the samples in use between two stamps, by the IMU's parameters (25,).
@@ -72,16 +74,57 @@ class SampleBuffer:
         Raises:
             MeasurementError: If they do not cover it.
         """
-        return preintegrate(*self._extended(), start_ns, end_ns, parameters, self._noise, self._max_gap_ns)
+        samples = self.between(np.array([start_ns, end_ns]), is_offset_known=True)
+        return preintegrate(
+            samples.stamps_ns, samples.readings, start_ns, end_ns, parameters, samples.noise_densities,
+            samples.max_gap_ns, samples.noise_factors,
+        )  # fmt: skip
 
-    def between(self, stamps_ns: Int, is_offset_known: bool) -> InertialSamples:
+    def between(self, stamps_ns: Int, is_offset_known: bool, bridges: bool = True) -> InertialSamples:
         """Return the samples in use, for the intervals between the stamps (K,) of states.
 
         Args:
             stamps_ns: (K,).
             is_offset_known: whether the time offset is taken for known, and stays as it is.
+            bridges: whether an interval is covered where samples are missing in it.
         """
-        return InertialSamples(*self._extended(is_offset_known), stamps_ns, self._noise, self._max_gap_ns)
+        stamps, readings = self._extended(is_offset_known)
+        if not bridges or not len(stamps):
+            factors = np.ones((len(stamps), 2))
+            return InertialSamples(stamps, readings, stamps_ns, self._noise, self._max_gap_ns, factors)
+        steps_ns = np.diff(stamps)
+        is_missing = (steps_ns > self._max_gap_ns) & (steps_ns <= _MAX_BRIDGED_NS)
+        until_ns = stamps_ns[-1] + int(np.ceil(self.time_offset_s * 1e9))
+        if 0 < until_ns - stamps[-1] <= _MAX_BRIDGED_NS:
+            stamps = np.append(stamps, until_ns + MAX_TIME_OFFSET_NS)
+            readings = np.concatenate([readings, readings[-1:]])
+            is_missing = np.append(is_missing, True)
+        samples = InertialSamples(
+            stamps, readings, stamps_ns, self._noise, _MAX_BRIDGED_NS + MAX_TIME_OFFSET_NS, np.ones((len(stamps), 2))
+        )
+        return self._bridged(samples, is_missing) if is_missing.any() else samples
+
+    def _bridged(self, samples: InertialSamples, is_missing: Bool) -> InertialSamples:
+        """Return samples with noise by motion that is not measured in some of the N - 1 steps between them.
+
+        Such steps are divided at the states: what is not measured differs from one interval to the next.
+        """
+        states_ns = samples.keyframes_ns + self._offset_ns
+        step = np.searchsorted(samples.stamps_ns, states_ns) - 1
+        within = (step >= 0) & (step < len(is_missing))
+        states_ns = states_ns[within][is_missing[step[within]]]
+        stamps = np.union1d(samples.stamps_ns, states_ns)
+        readings = np.stack([np.interp(stamps, samples.stamps_ns, values) for values in samples.readings.T], axis=1)
+        step = np.searchsorted(samples.stamps_ns, stamps[:-1], side="right") - 1
+        missing = np.flatnonzero(is_missing[step])
+        missing_s, parts_s = (
+            1e-9 * each for each in (np.diff(samples.stamps_ns)[step[missing]], np.diff(stamps)[missing])
+        )
+        # The force errs by the acceleration, and the rate by what it changes by until it is measured again.
+        sigmas = self._unmeasured * np.stack([missing_s, np.ones_like(missing_s)], axis=1)
+        factors = np.ones((len(stamps), 2))
+        factors[missing] += parts_s[:, None] * (sigmas / self._noise) ** 2
+        return samples._replace(stamps_ns=stamps, readings=readings, noise_factors=factors)
 
     @property
     def _offset_ns(self) -> int:

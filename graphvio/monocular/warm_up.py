@@ -25,7 +25,9 @@ def adjust_no_keyframes(rig: Rig) -> None:
     stamps = np.arange(-second // 10, second, 5_000_000)
     readings = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2], (len(stamps), 1))
     keyframes = np.array([0, second // 10])
-    samples = InertialSamples(stamps, readings, keyframes, np.array([1e-3, 1e-2]), 50_000_000)
+    samples = InertialSamples(
+        stamps, readings, keyframes, np.array([1e-3, 1e-2]), 50_000_000, np.ones((len(stamps), 2))
+    )
     states = States(keyframes, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3)), level_gravity(), np.zeros(6))
     prior = first_prior(states, np.ones(6), np.zeros(6), POSE_SIGMAS)
     cameras = Cameras.of(rig)

@@ -128,7 +128,7 @@ class ImuOfFramesets:
             self._report(
                 end_ns,
                 EventKind.IMU_NOT_COVERING,
-                "no IMU samples since the frameset before: constant velocity instead",
+                "IMU samples are missing since the frameset before: the motion is predicted without them",
             )
         return interval
 

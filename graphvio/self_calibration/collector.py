@@ -105,6 +105,7 @@ class WindowCollector:
             np.array([keyframe.stamp_ns for keyframe in window]),
             np.hypot(noise, _noise_of_stamps(window, values[:, :3], self.stamp_sigma_s)),
             _MAX_IMU_GAP_NS,
+            np.ones((len(stamps), 2)),
         )
 
 

@@ -32,6 +32,7 @@ class InertialSamples(NamedTuple):
         keyframes_ns: (K,) stamps of the keyframes, of the cameras' clock.
         noise_densities: (2,) white noise of gyro, rad/s/sqrt(Hz), and of accelerometer, m/s^2/sqrt(Hz).
         max_gap_ns: between samples of one interval.
+        noise_factors: (N, 2) by which the noise's variance is larger from each sample to the next.
     """
 
     stamps_ns: Int
@@ -39,12 +40,15 @@ class InertialSamples(NamedTuple):
     keyframes_ns: Int
     noise_densities: Float
     max_gap_ns: int
+    noise_factors: Float
 
     def without(self, intervals: Int) -> InertialSamples:
         """Return the samples without those of some intervals between keyframes, which are then not covered."""
         interval = np.searchsorted(self.keyframes_ns, self.stamps_ns, side="right") - 1
         kept = ~np.isin(interval, intervals)
-        return self._replace(stamps_ns=self.stamps_ns[kept], readings=self.readings[kept])
+        return self._replace(
+            stamps_ns=self.stamps_ns[kept], readings=self.readings[kept], noise_factors=self.noise_factors[kept]
+        )
 
     def intervals_with_spikes(self) -> Int:
         """Return the intervals between keyframes with a sample that is far from the one before and the one after."""
@@ -203,7 +207,7 @@ def inertial_equations(samples: InertialSamples, states: InertialStates) -> Iner
             continue
         preintegrated = integrate_samples(
             samples.stamps_ns, samples.readings, first, last, start_ns, end_ns, states.parameters,
-            samples.noise_densities,
+            samples.noise_densities, samples.noise_factors,
         )  # fmt: skip
         error, jacobian = inertial_residual(
             states.poses[i], states.velocities[i], states.poses[i + 1], states.velocities[i + 1], states.gravity,

@@ -63,6 +63,7 @@ def preintegrate(
     parameters: Float,
     noise_densities: Float,
     max_gap_ns: int = 50_000_000,
+    noise_factors: Float | None = None,
 ) -> Preintegrated:
     """Integrate the samples between two instants of the cameras' time.
 
@@ -74,6 +75,7 @@ def preintegrate(
         parameters: (25,) of the IMU.
         noise_densities: (2,) white noise of gyro, rad/s/sqrt(Hz), and of accelerometer, m/s^2/sqrt(Hz).
         max_gap_ns: between samples of one interval.
+        noise_factors: (N, 2) by which the noise's variance is larger from each sample to the next; None if it is not.
 
     Raises:
         MeasurementError: if the samples do not cover the interval.
@@ -84,7 +86,8 @@ def preintegrate(
             f"IMU samples do not cover the interval from {start_ns} to {end_ns} ns of the cameras' time without gaps: "
             "pass samples from before its start to after its end, both moved by the time offset"
         )
-    return integrate_samples(stamps_ns, readings, first, last, start_ns, end_ns, parameters, noise_densities)
+    factors = np.ones((len(stamps_ns), 2)) if noise_factors is None else noise_factors
+    return integrate_samples(stamps_ns, readings, first, last, start_ns, end_ns, parameters, noise_densities, factors)
 
 
 @kernel
@@ -111,7 +114,7 @@ def covering_samples(
 @kernel
 def integrate_samples(
     stamps_ns: Int, readings: Float, first: int, last: int, start_ns: int, end_ns: int, parameters: Float,
-    noise_densities: Float,
+    noise_densities: Float, noise_factors: Float,
 ) -> Preintegrated:  # fmt: skip
     """Integrate the samples from one index to another, see `covering_samples` and `preintegrate`."""
     offset_s, duration_s = parameters[TIME_OFFSET], (end_ns - start_ns) * NANOSECOND_S
@@ -161,8 +164,8 @@ def integrate_samples(
                 position[c] += h * velocity[c] + h * h / 6.0 * (start_force[c] + 2.0 * middle_force[c])
                 velocity[c] += h / 6.0 * (start_force[c] + 4.0 * middle_force[c] + end_force[c])
             add_derivatives(h, middle_rotation, middle_force, raw_middle, sums)
-            add_noise(h, middle_force, turned_s, noise_densities, levers, spread)
-            turned_s += h
+            add_noise(h, middle_force, turned_s, noise_densities, noise_factors[i], levers, spread)
+            turned_s += h * noise_factors[i, 0]
             put(rotation, end_rotation)
             put(start_force, end_force)
             put(at_start, at_end)

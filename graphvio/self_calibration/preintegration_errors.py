@@ -95,7 +95,9 @@ def fill_time_offset_column(
 
 
 @kernel
-def add_noise(h: float, force: Float, turned_s: float, noise_densities: Float, levers: Float, spread: Float) -> None:
+def add_noise(
+    h: float, force: Float, turned_s: float, noise_densities: Float, noise_factors: Float, levers: Float, spread: Float
+) -> None:
     """Propagate the covariance over a step, frame of the interval's start.
 
     The rotation's covariance is a multiple of I there. Those of velocity and position with it are cross products,
@@ -104,13 +106,14 @@ def add_noise(h: float, force: Float, turned_s: float, noise_densities: Float, l
     Args:
         h: duration of the step, s.
         force: (3,) in its middle.
-        turned_s: duration of the steps before.
+        turned_s: duration of the steps before, each times its factor for the gyro.
         noise_densities: (2,) of gyro and accelerometer.
+        noise_factors: (2,) by which their variances in this step are larger.
         levers: (2, 3) of velocity and position.
         spread: (3, 3, 3) covariances of velocity, of position with velocity, and of position.
     """
-    turn = noise_densities[0] ** 2 * (turned_s + 0.5 * h)
-    noise = noise_densities[1] ** 2 * h
+    turn = noise_densities[0] ** 2 * (turned_s + 0.5 * h * noise_factors[0])
+    noise = noise_densities[1] ** 2 * h * noise_factors[1]
     of_velocity, of_position = levers
     velocity, mixed, position = spread
     for r in range(3):
