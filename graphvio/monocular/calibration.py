@@ -16,7 +16,7 @@ from graphvio.monocular.adjustment import Adjusted, Measurements, equations, evi
 from graphvio.monocular.states import Prior, States
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FactorLikelihood, FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.parameters import n_of_cameras
 from graphvio.self_calibration.prior import file_prior
@@ -24,6 +24,7 @@ from graphvio.self_calibration.prior import file_prior
 _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of lenses, and of places and the IMU
 _MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts of it that nothing has shown yet
 _FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
+_FAR_OFF = 3.0  # factor of a file whose scale is not to be trusted
 _MAX_SIGMAS = 4.0  # no file is so wrong: the window is
 _WALK = 0.01  # in one second, as a share of the file's standard deviations
 _ESTIMATE_EVERY_NS = 1_000_000_000
@@ -138,6 +139,17 @@ class WindowCalibration:
         self._kept = Evidence.none(len(self._rows))
         self._files.clear()
 
+    def is_contradicted(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
+        """Return whether a first window, adjusted with an exact file, says that places or the IMU are far off in it.
+
+        Arguments as `doubts_file`.
+        """
+        if not self.size:
+            return False
+        likelihood = FactorLikelihood(self._kept.plus(self._evidence_of(measured, adjusted, prior)), self._prior)
+        as_stated, far_off = (likelihood(np.array([_MIN_FACTOR, factor])) for factor in (EXACT, _FAR_OFF))
+        return bool(far_off - as_stated > _MIN_LOG_BAYES_FACTORS[1])
+
     def doubts_file(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Let the window say how wrong the rig file is, and return whether that is news.
 
@@ -148,11 +160,16 @@ class WindowCalibration:
         """
         if not self.size:
             return False
-        file, at = self.file(), adjusted.equations
+        file = self.file()
         if file is None:
-            file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
-            at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
-        return self.update(evidence_of(at, adjusted.states, file))
+            return self.update(self._evidence_of(measured, adjusted, prior))
+        return self.update(evidence_of(adjusted.equations, adjusted.states, file))
+
+    def _evidence_of(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> Evidence:
+        """Return what a window that was adjusted with an exact file says of it."""
+        file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
+        at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
+        return evidence_of(at, adjusted.states, file)
 
     def update(self, evidence: Evidence) -> bool:
         """Take what the window and what left it say of the calibration.

@@ -75,6 +75,7 @@ class Initialiser:
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
         self._fits_no_motion = False  # the window that was tested last
+        self._is_file_doubted, self._doubting = False, 0  # keyframes
         self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows
         self.reason = "no image has come"
         self.scale_sigma = np.inf  # of the window that was tested last, as a share
@@ -115,10 +116,13 @@ class Initialiser:
 
     def _candidates(self) -> list[Float]:
         """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
+        if self._is_file_doubted:  # every other keyframe: each attempt takes as long as many framesets
+            self._doubting += 1
+            return self._calibration.candidates[1:] if self._doubting % 2 else []
         self._contradicted += self._fits_no_motion
         if not (self._doubts_file and self._fits_no_motion) or self._contradicted < self._doubted_at:
             return self._calibration.candidates[:1]
-        self._doubted_at *= 2  # each attempt takes as long as many framesets
+        self._doubted_at *= 2
         self._calibration.forget()
         return self._calibration.candidates
 
@@ -179,6 +183,10 @@ class Initialiser:
             views = [each.without(ids[off]) for each in views]
         self.reason = self._fault(adjusted, fitting, factors) or _ambiguity(measured, adjusted, prior, file)
         if self.reason:
+            return None
+        if file is None and self._doubts_file and self._calibration.is_contradicted(measured, adjusted, prior):
+            self._fits_no_motion = self._is_file_doubted = True
+            self.reason = "images and IMU contradict the rig file"
             return None
         still = [k in stationary for k in range(n)]
         return self._in_nav(Window(states, views, still, names, landmarks, prior, factors))
