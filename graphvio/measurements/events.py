@@ -32,7 +32,7 @@ class EventKind(StrEnum):
     UNKNOWN_PAIR = "unknown_pair"
     """A frameset has images of a pair that is not in the rig; they are left out."""
     IMU_NOT_COVERING = "imu_not_covering"
-    """No IMU samples cover the interval between two framesets; constant velocity is assumed."""
+    """No IMU samples cover the interval between two framesets; the motion is predicted without them."""
     IMU_LEFT_OUT = "imu_left_out"
     """The IMU contradicts vision of good quality for long; it is left out until it moves as they do."""
     IMU_USED_AGAIN = "imu_used_again"
