@@ -23,6 +23,8 @@ class EventKind(StrEnum):
     """The stamp of an IMU sample is far ahead of its neighbours'; it is left out."""
     IMU_STUCK = "imu_stuck"
     """An axis of the IMU repeats its value beyond what noise allows; samples are left out until it changes again."""
+    IMU_SPIKE = "imu_spike"
+    """A single IMU sample is far from the ones before and after it; it is left out."""
     FRAMESET_DUPLICATE_STAMP = "frameset_duplicate_stamp"
     """A frameset comes less than 1 ms after the one before; it is left out."""
     FRAMESET_BACKWARD_STAMP = "frameset_backward_stamp"

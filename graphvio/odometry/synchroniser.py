@@ -14,6 +14,7 @@ from graphvio.config import Config
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import FrameSet, ImuSample
+from graphvio.odometry.spike_guard import SpikeGuard
 from graphvio.odometry.stamp_jitter import StampJitter
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_correction import ImuCorrection
@@ -61,6 +62,7 @@ class Synchroniser:
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
         self._jitter = StampJitter()
+        self._spikes = SpikeGuard(report)
         self._sample_jumps: JumpGuard[ImuSample] = JumpGuard(EventKind.IMU_FUTURE_STAMP, report)
         self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
 
@@ -70,11 +72,12 @@ class Synchroniser:
             sample = replace(sample, stamp_ns=sample.stamp_ns - self._clock_ns)
         usable = []
         for confirmed in self._sample_jumps.confirm(sample):
-            fault = self._imu.add(confirmed)
-            if fault:
-                self._report(confirmed.stamp_ns, fault, "sample left out")
-            else:
-                usable.append(confirmed)
+            for each in self._spikes.confirm(confirmed):
+                fault = self._imu.add(each)
+                if fault:
+                    self._report(each.stamp_ns, fault, "sample left out")
+                else:
+                    usable.append(each)
         return usable
 
     def corrected(self, sample: ImuSample) -> tuple[int, Float]:
@@ -189,6 +192,7 @@ class Synchroniser:
         self._clock_ns += round(seconds * 1e9)
         self._imu = ImuBuffer(self._timing.max_imu_gap_ms)
         self._sample_jumps = JumpGuard(EventKind.IMU_FUTURE_STAMP, self._report)
+        self._spikes = SpikeGuard(self._report)
 
     def shift_imu(self, seconds: float) -> None:
         """Add a correction, seconds, to the offset of the IMU's stamps from the framesets'."""

@@ -1,0 +1,116 @@
+"""Single IMU samples that are far from both neighbours are left out, and nothing else is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphvio import FrameSet, ImuSample, Odometry, open_source
+from graphvio.arrays import Float
+from graphvio.evaluation import evaluate
+from graphvio.measurements.events import EventKind
+from graphvio.odometry import spike_guard
+from graphvio.odometry.spike_guard import SpikeGuard
+from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+CLIP = DATA / "euroc_mh01_clip"
+STEP_NS = 5_000_000
+
+
+def samples_of(readings: Float) -> list[ImuSample]:
+    return [ImuSample(k * STEP_NS, values[:3], values[3:]) for k, values in enumerate(readings)]
+
+
+def standing(n: int) -> Float:
+    noise = np.repeat([2e-3, 2e-2], 3) * np.random.default_rng(0).standard_normal((n, 6))
+    return np.asarray(noise + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
+
+
+def guarded(samples: list[ImuSample]) -> tuple[list[int], list[int]]:
+    """Return the stamps of the samples that pass, and of those that are left out, in steps."""
+    left_out: list[int] = []
+    guard = SpikeGuard(lambda stamp_ns, kind, _: left_out.append(stamp_ns) if kind is EventKind.IMU_SPIKE else None)
+    passed = [each.stamp_ns for sample in samples for each in guard.confirm(sample)]
+    return [stamp // STEP_NS for stamp in passed], [stamp // STEP_NS for stamp in left_out]
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_single_sample_far_from_its_neighbours_is_left_out(axis: int) -> None:
+    readings = standing(80)
+    readings[[40, 60], axis] += [3.0, -3.0]
+    passed, left_out = guarded(samples_of(readings))
+    assert left_out == [40, 60]
+    assert passed == [k for k in range(80) if k not in left_out]
+
+
+def test_suspect_is_held_until_the_next_sample_and_passed_in_time_order() -> None:
+    readings = standing(80)
+    readings[50:, 3] += 5.0  # it goes on
+    guard = SpikeGuard(lambda *_: pytest.fail("no spike"))
+    passed = [[each.stamp_ns // STEP_NS for each in guard.confirm(sample)] for sample in samples_of(readings)]
+    assert passed[49:53] == [[49], [], [50, 51], [52]]
+
+
+def test_shocks_vibration_and_motion_pass() -> None:
+    shock = standing(80)
+    shock[40:43, 3:] += [[20.0, -8.0, 5.0], [35.0, 4.0, 12.0], [-15.0, 6.0, 3.0]]
+    vibration = standing(400)
+    vibration[100:] += np.random.default_rng(1).standard_normal((300, 6)) * np.linspace(0.0, 1.0, 300)[:, None] * [
+        0.3, 0.3, 0.3, 8.0, 8.0, 8.0
+    ]  # fmt: skip
+    times = np.arange(400)[:, None] * 1e-9 * STEP_NS
+    turning = standing(400) + np.sin(2.0 * np.pi * 5.0 * times) * np.repeat([4.0, 15.0], 3)
+    for readings in (shock, vibration, turning):
+        passed, left_out = guarded(samples_of(readings))
+        assert not left_out
+        assert passed == list(range(len(readings)))
+
+
+def test_samples_that_no_sensor_reads_are_left_to_others() -> None:
+    readings = standing(80)
+    readings[[0, 45, 46], 2] = np.nan
+    readings[60, 5] = np.inf
+    passed, left_out = guarded(samples_of(readings))
+    assert not left_out
+    assert passed == list(range(80))
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="the real recordings are not here")
+@pytest.mark.parametrize("recording", ["euroc_mh01_clip", "euroc_v101_imu"])
+def test_real_flights_have_no_spikes_with_half_the_limits(recording: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_OVER_MEAN", "_OVER_NEIGHBOURS", "_MIN_RATE", "_MIN_FORCE"):
+        monkeypatch.setattr(spike_guard, name, 0.5 * getattr(spike_guard, name))
+    rows = np.genfromtxt(DATA / recording / "mav0" / "imu0" / "data.csv", delimiter=",", comments="#")
+    passed, left_out = guarded(samples_of(rows[:, 1:7]))
+    assert not left_out
+    assert len(passed) == len(rows)
+
+
+@pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
+def test_odometry_with_spikes_is_as_good_as_without() -> None:
+    """One sample a second is off: the path was wrong by decimetres, and vision was refused."""
+    source, rng = open_source(CLIP), np.random.default_rng(5)
+    odometry, estimates, framesets = Odometry(source.rig), [], 0
+    for measurement in open_source(CLIP, to_s=10.0):
+        each = measurement
+        if isinstance(each, ImuSample) and rng.random() < 0.005:
+            wrong_rate, wrong_force = 20.0 * rng.standard_normal(3), 100.0 * rng.standard_normal(3)
+            each = ImuSample(each.stamp_ns, each.angular_velocity + wrong_rate, each.linear_acceleration + wrong_force)
+        framesets += isinstance(each, FrameSet)
+        estimates.append(odometry.process(each))
+    poses = [
+        (each.stamp_ns, each.nav_T_body)
+        for each in (*estimates, *odometry.finish())
+        if each is not None and each.nav_T_body is not None
+    ]
+    assert len(poses) == framesets
+    kinds = {event.kind for event in odometry.take_events()}
+    assert EventKind.IMU_SPIKE in kinds
+    assert not kinds & {EventKind.VISION_GATED, EventKind.IMU_LEFT_OUT, EventKind.LOST}
+    assert source.truth is not None
+    estimated = Trajectory(np.array([stamp_ns for stamp_ns, _ in poses]), np.array([pose for _, pose in poses]))
+    assert evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse < 0.006
