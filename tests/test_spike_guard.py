@@ -55,6 +55,14 @@ def test_suspect_is_held_until_the_next_sample_and_passed_in_time_order() -> Non
     assert passed[49:53] == [[49], [], [50, 51], [52]]
 
 
+def test_spike_before_a_sample_that_no_sensor_reads_is_judged_by_the_next_one() -> None:
+    readings = standing(80)
+    readings[50, 3], readings[51, 0] = 5.0, np.nan
+    passed, left_out = guarded(samples_of(readings))
+    assert left_out == [50]
+    assert passed == [k for k in range(80) if k != 50]
+
+
 def test_shocks_vibration_and_motion_pass() -> None:
     shock = standing(80)
     shock[40:43, 3:] += [[20.0, -8.0, 5.0], [35.0, 4.0, 12.0], [-15.0, 6.0, 3.0]]

@@ -184,7 +184,7 @@ class MonocularEstimator:
                 self._trust.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
-        """Add a state by the IMU; where it has not come for a second, the epoch ends."""
+        """Add a state by the IMU; where that has been silent for 5 s, the epoch ends."""
         self.gate_results = {}
         self._rate = None
         window, before_ns = self._window, self._latest_ns

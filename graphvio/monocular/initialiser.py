@@ -75,7 +75,7 @@ class Initialiser:
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
         self._fits_no_motion = False  # the window that was tested last
-        self._is_file_doubted, self._doubting = False, 0  # keyframes
+        self._is_file_doubted, self._keyframes_in_doubt = False, 0
         self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows
         self.reason = "no image has come"
         self.scale_sigma = np.inf  # of the window that was tested last, as a share
@@ -117,8 +117,8 @@ class Initialiser:
     def _candidates(self) -> list[Float]:
         """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
         if self._is_file_doubted:  # every other keyframe: each attempt takes as long as many framesets
-            self._doubting += 1
-            return self._calibration.candidates[1:] if self._doubting % 2 else []
+            self._keyframes_in_doubt += 1
+            return self._calibration.candidates[1:] if self._keyframes_in_doubt % 2 else []
         self._contradicted += self._fits_no_motion
         if not (self._doubts_file and self._fits_no_motion) or self._contradicted < self._doubted_at:
             return self._calibration.candidates[:1]

@@ -20,8 +20,8 @@ _MAX_BRIDGED_NS = 5_000_000_000
 class SampleBuffer:
     """Keeps the samples between the oldest state that is of use and the newest one.
 
-    Where samples are missing for up to a second, readings are interpolated, or the newest one is held, and their noise
-    is that of a rig that moves as it likes: the cameras carry the scale on.
+    Where samples are missing for up to 5 s, readings are interpolated, or the newest one is held, and their noise is
+    that of motion that is not measured: the cameras carry the scale on.
 
     Args:
         imu: Of the rig.
@@ -109,19 +109,16 @@ class SampleBuffer:
 
         Such steps are divided at the states: what is not measured differs from one interval to the next.
         """
-        states_ns = samples.keyframes_ns + self._offset_ns
-        step = np.searchsorted(samples.stamps_ns, states_ns) - 1
-        within = (step >= 0) & (step < len(is_missing))
-        states_ns = states_ns[within][is_missing[step[within]]]
-        stamps = np.union1d(samples.stamps_ns, states_ns)
-        readings = np.stack([np.interp(stamps, samples.stamps_ns, values) for values in samples.readings.T], axis=1)
-        step = np.searchsorted(samples.stamps_ns, stamps[:-1], side="right") - 1
+        before_ns, states_ns = samples.stamps_ns, samples.keyframes_ns + self._offset_ns
+        within = (states_ns > before_ns[0]) & (states_ns < before_ns[-1])
+        is_in_gap = is_missing[np.searchsorted(before_ns, states_ns[within]) - 1]
+        stamps = np.union1d(before_ns, states_ns[within][is_in_gap])
+        readings = np.stack([np.interp(stamps, before_ns, values) for values in samples.readings.T], axis=1)
+        step = np.searchsorted(before_ns, stamps[:-1], side="right") - 1  # of which each is a part
         missing = np.flatnonzero(is_missing[step])
-        missing_s, parts_s = (
-            1e-9 * each for each in (np.diff(samples.stamps_ns)[step[missing]], np.diff(stamps)[missing])
-        )
+        gaps_s, parts_s = 1e-9 * np.diff(before_ns)[step[missing]], 1e-9 * np.diff(stamps)[missing]
         # The force errs by the acceleration, and the rate by what it changes by until it is measured again.
-        sigmas = self._unmeasured * np.stack([missing_s, np.ones_like(missing_s)], axis=1)
+        sigmas = self._unmeasured * np.stack([gaps_s, np.ones_like(gaps_s)], axis=1)
         factors = np.ones((len(stamps), 2))
         factors[missing] += parts_s[:, None] * (sigmas / self._noise) ** 2
         return samples._replace(stamps_ns=stamps, readings=readings, noise_factors=factors)

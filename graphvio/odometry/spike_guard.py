@@ -32,13 +32,16 @@ class SpikeGuard:
 
     def confirm(self, sample: ImuSample) -> list[ImuSample]:
         """Take a sample, and return those that may be used now, in time order."""
-        if self._newest is None:
-            self._newest = sample if isfinite(sum(_change(sample, sample))) else None
-            return [sample]
-        confirmed = [] if self._suspect is None else self._judged(self._suspect, sample)
-        rate, force = _change(self._newest, sample)
+        rate, force = _change(self._newest or sample, sample)
         if not isfinite(rate + force):  # others refuse it
-            return [*confirmed, sample]
+            return [sample]
+        if self._newest is None:
+            self._newest = sample
+            return [sample]
+        confirmed = []
+        if self._suspect is not None:
+            confirmed = self._judged(self._suspect, sample)
+            rate, force = _change(self._newest, sample)
         if self._is_far(rate, force):
             self._suspect = sample
             return confirmed
