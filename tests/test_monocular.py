@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -699,19 +699,32 @@ def test_estimator_without_points_coasts_and_goes_on() -> None:
 # ------------------------------------------------------------------ rigs and commands
 
 
-def test_estimator_bridges_late_imu_samples_and_missing_ones() -> None:
+@pytest.mark.parametrize(
+    ("gap", "offset_ms"), [({"late": (3.0, 3.3)}, 0), ({"missing": (3.0, 5.0)}, 0), ({"missing": (3.0, 4.0)}, 8)]
+)
+def test_estimator_bridges_late_imu_samples_and_missing_ones(gap: dict[str, Any], offset_ms: int) -> None:
     """A step's noise is that of its length, so poses go on, and the scale with them."""
-    for flown in (fly(moving(), 5.0, late=(3.0, 3.3)), fly(moving(), 7.0, missing=(3.0, 5.0))):
-        error_m, scale = aligned(flown)
-        after = flown.statuses[flown.statuses.index(Status.TRACKING) :]
-        assert set(after) == {Status.TRACKING}
-        assert flown.estimator.epoch == 0
-        assert error_m < 0.01
-        assert abs(scale - 1.0) < 0.01
-    lost = fly(moving(), 9.0, missing=(2.0, 7.5))
-    assert lost.estimator.epoch == 1
-    before = lost.stamps_s[lost.stamps_s < 8.0]
-    assert before[-1] == pytest.approx(6.95)  # until 5 s after the newest sample
+    flown = fly(moving(), 7.0, offset_ms=offset_ms, **gap)
+    error_m, scale = aligned(flown)
+    after = flown.statuses[flown.statuses.index(Status.TRACKING) :]
+    assert set(after) == {Status.TRACKING}
+    assert flown.estimator.epoch == 0
+    assert error_m < 0.01
+    assert abs(scale - 1.0) < 0.01
+
+
+def test_estimator_is_lost_once_the_imu_has_been_silent_for_5_s() -> None:
+    flown = fly(moving(), 9.0, missing=(2.0, 7.5))
+    assert flown.estimator.epoch == 1
+    before = flown.stamps_s[flown.stamps_s < 8.0]
+    assert before[-1] == pytest.approx(6.95)
+
+
+def test_gap_before_the_scale_is_known_delays_it() -> None:
+    flown = fly(moving(), 4.0, missing=(0.4, 0.8))
+    assert flown.estimator.epoch == 0
+    assert flown.stamps_s[0] > 1.8  # a second after the gap
+    assert aligned(flown)[0] < 0.02
 
 
 def test_rig_of_single_cameras_without_an_imu_names_camera_and_remedy() -> None:

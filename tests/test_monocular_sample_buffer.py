@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from graphvio.config import Config
 from graphvio.config.stages import TimingConfig
@@ -43,6 +44,29 @@ def test_missing_samples_are_covered_where_they_are_bridged() -> None:
         assert buffer.covers(start_ms * MS, end_ms * MS)
     assert not buffer.covers(60 * MS, 5_200 * MS)  # beyond what can be bridged
     assert not buffer.covers(-10 * MS, 20 * MS)
+
+
+@pytest.mark.parametrize("gap_ms", [21, 1_000, 4_990, 5_000, 5_010, 5_029, 5_030, 5_031, 5_100])
+def test_gap_is_not_covered_or_has_the_noise_of_one(gap_ms: int) -> None:
+    buffer = filled([0, 10, 10 + gap_ms, 20 + gap_ms])
+    buffer.collect(0, (20 + gap_ms) * MS)
+    states_ns = np.array([5, 15 + gap_ms]) * MS
+    is_covered = buffer.covers(*states_ns.tolist())
+    assert is_covered == (gap_ms <= 5_030)
+    if is_covered:
+        samples = buffer.between(states_ns, is_offset_known=True)
+        assert (samples.noise_factors[samples.stamps_ns == 10 * MS] > 1e3).all()
+
+
+@pytest.mark.parametrize("offset_ms", [-8, 8])
+def test_gap_is_divided_at_the_states_by_the_clock_of_the_samples(offset_ms: int) -> None:
+    buffer = filled([0, 10, 20, 30, 90, 100])
+    buffer.time_offset_s = 1e-3 * offset_ms
+    buffer.collect(0, 100 * MS)
+    samples = buffer.between(np.array([20, 60, 130]) * MS, is_offset_known=True)
+    assert (60 + offset_ms) * MS in samples.stamps_ns
+    assert samples.stamps_ns[-1] >= (130 + offset_ms) * MS
+    assert buffer.covers(20 * MS, 130 * MS)
 
 
 def test_noise_of_missing_samples_is_that_of_motion_that_is_not_measured() -> None:

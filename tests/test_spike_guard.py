@@ -21,8 +21,8 @@ CLIP = DATA / "euroc_mh01_clip"
 STEP_NS = 5_000_000
 
 
-def samples_of(readings: Float) -> list[ImuSample]:
-    return [ImuSample(k * STEP_NS, values[:3], values[3:]) for k, values in enumerate(readings)]
+def samples_of(readings: Float, step_ns: int = STEP_NS) -> list[ImuSample]:
+    return [ImuSample(k * step_ns, values[:3], values[3:]) for k, values in enumerate(readings)]
 
 
 def standing(n: int) -> Float:
@@ -30,12 +30,13 @@ def standing(n: int) -> Float:
     return np.asarray(noise + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
 
 
-def guarded(samples: list[ImuSample]) -> tuple[list[int], list[int]]:
+def guarded(samples: list[ImuSample], step_ns: int = STEP_NS) -> tuple[list[int], list[int]]:
     """Return the stamps of the samples that pass, and of those that are left out, in steps."""
     left_out: list[int] = []
     guard = SpikeGuard(lambda stamp_ns, kind, _: left_out.append(stamp_ns) if kind is EventKind.IMU_SPIKE else None)
     passed = [each.stamp_ns for sample in samples for each in guard.confirm(sample)]
-    return [stamp // STEP_NS for stamp in passed], [stamp // STEP_NS for stamp in left_out]
+    passed += [each.stamp_ns for each in guard.end()]
+    return [stamp // step_ns for stamp in passed], [stamp // step_ns for stamp in left_out]
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -56,26 +57,61 @@ def test_suspect_is_held_until_the_next_sample_and_passed_in_time_order() -> Non
 
 
 def test_spike_before_a_sample_that_no_sensor_reads_is_judged_by_the_next_one() -> None:
-    readings = standing(80)
+    readings, step_ns = standing(80), STEP_NS // 2
     readings[50, 3], readings[51, 0] = 5.0, np.nan
-    passed, left_out = guarded(samples_of(readings))
+    passed, left_out = guarded(samples_of(readings, step_ns), step_ns)
     assert left_out == [50]
     assert passed == [k for k in range(80) if k != 50]
 
 
-def test_shocks_vibration_and_motion_pass() -> None:
-    shock = standing(80)
-    shock[40:43, 3:] += [[20.0, -8.0, 5.0], [35.0, 4.0, 12.0], [-15.0, 6.0, 3.0]]
-    vibration = standing(400)
-    vibration[100:] += np.random.default_rng(1).standard_normal((300, 6)) * np.linspace(0.0, 1.0, 300)[:, None] * [
-        0.3, 0.3, 0.3, 8.0, 8.0, 8.0
-    ]  # fmt: skip
-    times = np.arange(400)[:, None] * 1e-9 * STEP_NS
-    turning = standing(400) + np.sin(2.0 * np.pi * 5.0 * times) * np.repeat([4.0, 15.0], 3)
-    for readings in (shock, vibration, turning):
-        passed, left_out = guarded(samples_of(readings))
+def test_last_sample_is_passed_though_none_judges_it() -> None:
+    readings = standing(80)
+    readings[79, 3] = 5.0
+    assert guarded(samples_of(readings)) == (list(range(80)), [])
+
+
+@pytest.mark.parametrize("rate_hz", [66.0, 80.0, 99.0, 99.9, 100.0])
+def test_sudden_vibration_passes(rate_hz: float) -> None:
+    readings, times = standing(2000), 5e-3 * np.arange(2000)
+    readings[100:, 3] += 8.0 * np.cos(2.0 * np.pi * rate_hz * times[100:])
+    passed, left_out = guarded(samples_of(readings))
+    assert not left_out
+    assert passed == list(range(2000))
+
+
+@pytest.mark.parametrize("duration_ms", [20.0, 30.0, 40.0])
+def test_shocks_of_several_samples_pass(duration_ms: float) -> None:
+    """The peak of a shock is far from both neighbours, which are alike."""
+    readings, times = standing(3500), 5.0 * np.arange(3500)
+    for k in range(35):
+        phase = (times - (500.0 * k + 117.0 + 0.3 * k)) / duration_ms
+        readings[:, 3] += np.where((phase > 0.0) & (phase < 1.0), 25.0 * np.sin(np.pi * phase), 0.0)
+    assert not guarded(samples_of(readings))[1]
+
+
+@pytest.mark.parametrize("every", [2, 3, 4])
+def test_what_comes_often_is_measured(every: int) -> None:
+    readings = standing(1000)
+    readings[100::every, 3] += 5.0
+    left_out = guarded(samples_of(readings))[1]
+    assert len(left_out) < 15
+    assert max(left_out, default=0) < 200
+
+
+def test_shocks_of_one_sample_of_a_slow_imu_pass() -> None:
+    readings, step_ns = standing(500), 20_000_000
+    readings[50::50, 3] += 25.0
+    assert guarded(samples_of(readings, step_ns), step_ns) == (list(range(500)), [])
+
+
+def test_repeated_older_samples_judge_nothing() -> None:
+    readings = standing(80)
+    readings[50:, 3] += 5.0  # it goes on
+    samples = samples_of(readings)
+    for repeated in (45, 49, 50):  # after the step, and the step itself twice
+        passed, left_out = guarded([*samples[:51], samples[repeated], *samples[51:]])
         assert not left_out
-        assert passed == list(range(len(readings)))
+        assert [k for k in passed if k not in (45, 49)] == [k for k in range(80) if k not in (45, 49)]
 
 
 def test_samples_that_no_sensor_reads_are_left_to_others() -> None:

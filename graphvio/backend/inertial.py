@@ -32,6 +32,18 @@ _ROOM = 1024  # samples that the buffer has room for at first
 _NOISE_SAMPLES = 50  # that show the noise of an interval
 
 
+def value_fault(sample: ImuSample) -> str:
+    """Return the kind of fault of a sample whose values no sensor reads, or an empty string."""
+    rate, force = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()  # numpy is slow for three
+    if not all(map(isfinite, (*rate, *force))):
+        return EventKind.IMU_NOT_FINITE
+    if not any(force):  # nor does free fall give exact zeros
+        return EventKind.IMU_STUCK
+    if max(map(abs, rate)) > _MAX_RATE or max(map(abs, force)) > _MAX_FORCE:
+        return EventKind.IMU_OUT_OF_RANGE
+    return ""
+
+
 class ImuBuffer:
     """IMU samples in time order; unusable ones are named and left out.
 
@@ -58,24 +70,24 @@ class ImuBuffer:
 
     def add(self, sample: ImuSample) -> str:
         """Take a sample, and return the kind of its fault if it is unusable, or an empty string."""
-        rate, force = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()  # numpy is slow for three
-        if not all(map(isfinite, (*rate, *force))):
-            return EventKind.IMU_NOT_FINITE
-        if not any(force):  # nor does free fall give exact zeros
-            return EventKind.IMU_STUCK
-        if max(map(abs, rate)) > _MAX_RATE or max(map(abs, force)) > _MAX_FORCE:
-            return EventKind.IMU_OUT_OF_RANGE
-        newest_ns = self.newest_ns
-        if newest_ns is not None and sample.stamp_ns <= newest_ns:
-            return EventKind.IMU_DUPLICATE_STAMP if sample.stamp_ns == newest_ns else EventKind.IMU_BACKWARD_STAMP
+        fault = value_fault(sample) or self.stamp_fault(sample)
+        if fault:
+            return fault
         if self._stuck.shows(sample):
             return EventKind.IMU_STUCK
         if self._end == len(self._stamps):
             self._make_room()
         self._stamps[self._end] = sample.stamp_ns
-        self._values[self._end] = (*rate, *force)
+        self._values[self._end, :3], self._values[self._end, 3:] = sample.angular_velocity, sample.linear_acceleration
         self._end += 1
         return ""
+
+    def stamp_fault(self, sample: ImuSample) -> str:
+        """Return the kind of fault of a sample that is not newer than those before it, or an empty string."""
+        newest_ns = self.newest_ns
+        if newest_ns is None or sample.stamp_ns > newest_ns:
+            return ""
+        return EventKind.IMU_DUPLICATE_STAMP if sample.stamp_ns == newest_ns else EventKind.IMU_BACKWARD_STAMP
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether a sample at or after an instant has come."""

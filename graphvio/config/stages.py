@@ -152,9 +152,10 @@ class SmootherConfig(Stage):
     """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate: real flights
     need it for a consistent covariance. Online, where samples show more noise than that, theirs is used."""
     motion_accel_sigma_m_s2: float = 5.0
-    """Without an IMU: standard deviation of the acceleration, eq. (11)."""
+    """Without an IMU, and for single cameras where its samples are missing: standard deviation of the acceleration, eq.
+    (11)."""
     motion_angular_accel_sigma_rad_s2: float = 10.0
-    """Without an IMU: standard deviation of the angular acceleration, eq. (11)."""
+    """The same of the angular acceleration, eq. (11)."""
     lost_position_sigma_m: float = 1.0
     """Coasting ends in ``lost`` when the position has become less certain than this since vision was last used."""
 
@@ -211,7 +212,8 @@ class TimingConfig(Stage):
     max_imu_wait_ms: float = 100.0
     """A frameset whose IMU samples are missing is held until a measurement arrives that is newer by this much."""
     max_imu_gap_ms: float = 50.0
-    """A longer gap between IMU samples is not integrated over."""
+    """A longer gap between IMU samples is not integrated over; single cameras bridge up to 5 s, as motion that is not
+    measured."""
     max_prediction_ms: float = 200.0
     """Poses are predicted no later than this after the newest IMU sample, or without an IMU after the newest
     frameset."""

@@ -14,7 +14,7 @@ from graphvio.self_calibration.preintegration import Preintegrated, covering_sam
 _MARGIN_NS = 100_000_000
 MAX_TIME_OFFSET_NS = 30_000_000
 """By which the time offset of a rig file may be wrong."""
-_MAX_BRIDGED_NS = 5_000_000_000
+_MAX_BRIDGED_NS = 5_000_000_000 + MAX_TIME_OFFSET_NS
 
 
 class SampleBuffer:
@@ -95,13 +95,12 @@ class SampleBuffer:
         steps_ns = np.diff(stamps)
         is_missing = (steps_ns > self._max_gap_ns) & (steps_ns <= _MAX_BRIDGED_NS)
         until_ns = stamps_ns[-1] + int(np.ceil(self.time_offset_s * 1e9))
-        if 0 < until_ns - stamps[-1] <= _MAX_BRIDGED_NS:
-            stamps = np.append(stamps, until_ns + MAX_TIME_OFFSET_NS)
+        held_ns = until_ns + MAX_TIME_OFFSET_NS
+        if stamps[-1] < until_ns and held_ns - stamps[-1] <= _MAX_BRIDGED_NS:
+            stamps = np.append(stamps, held_ns)
             readings = np.concatenate([readings, readings[-1:]])
             is_missing = np.append(is_missing, True)
-        samples = InertialSamples(
-            stamps, readings, stamps_ns, self._noise, _MAX_BRIDGED_NS + MAX_TIME_OFFSET_NS, np.ones((len(stamps), 2))
-        )
+        samples = InertialSamples(stamps, readings, stamps_ns, self._noise, _MAX_BRIDGED_NS, np.ones((len(stamps), 2)))
         return self._bridged(samples, is_missing) if is_missing.any() else samples
 
     def _bridged(self, samples: InertialSamples, is_missing: Bool) -> InertialSamples:

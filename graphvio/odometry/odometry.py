@@ -185,6 +185,8 @@ class Odometry:
         """Return the estimates of the framesets still held when the input has ended; all poses are final then."""
         if self._finished:
             return []
+        for sample in self._synchroniser.last_samples():
+            self._add_sample(sample)
         estimates = []
         while (frameset := self._synchroniser.next_held()) is not None:
             estimates.append(self._estimate(frameset))

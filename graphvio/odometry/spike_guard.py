@@ -4,82 +4,111 @@ from __future__ import annotations
 
 from math import dist, isfinite
 
+from graphvio.backend.inertial import value_fault
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import ImuSample
 
 _OVER_MEAN, _OVER_NEIGHBOURS = 10.0, 4.0  # real flights do not reach half of this, with all their vibration
 _MIN_RATE, _MIN_FORCE = 0.2, 1.0  # rad/s and m/s^2
 _MIN_SAMPLES, _GAIN = 20, 0.02  # of the mean change from sample to sample
-_MAX_NS = 100_000_000  # from the sample before to the one after
+_MAX_STEP_NS = 8_000_000  # between samples: a real shock may be that short
+_MAX_LEFT_OUT = 0.1  # of the samples: what comes that often is measured
+
+
+_Change = tuple[float, float]  # of rate, rad/s, and force, m/s^2
+_NONE: _Change = (0.0, 0.0)
 
 
 class SpikeGuard:
     """Passes IMU samples on; one that is far from the one before is held until the next one shows which is wrong.
 
-    A spike is much farther from both neighbours than these are from each other, and than samples change in the mean:
-    shocks and vibrations, which last for longer than a sample or come again, are none.
+    A spike is much farther from both neighbours than these are from each other, than the last three before it are from
+    each other, and than samples change in the mean: shocks and vibrations, which last for longer than a sample or come
+    again, are none. Where samples are more than 8 ms apart, nothing is held.
 
     Args:
-        report: Receives an event for each spike.
+        report: Receives an event for each sample that is left out.
     """
 
     def __init__(self, report: Report) -> None:
         self._report = report
         self._newest: ImuSample | None = None  # of those that were passed on
         self._suspect: ImuSample | None = None
-        self._rate_change = self._force_change = 0.0  # from sample to sample, the mean
-        self._count = 0
+        self._mean: _Change = _NONE  # change from sample to sample
+        self._last: tuple[_Change, _Change] = (_NONE, _NONE)
+        self._count, self._left_out = 0, 0.0  # samples, and the recent share of those that were left out
 
     def confirm(self, sample: ImuSample) -> list[ImuSample]:
-        """Take a sample, and return those that may be used now, in time order."""
-        rate, force = _change(self._newest or sample, sample)
-        if not isfinite(rate + force):  # others refuse it
-            return [sample]
+        """Take a sample, and return those that may be used now, in time order, with those that no sensor reads."""
         if self._newest is None:
-            self._newest = sample
+            self._newest = None if value_fault(sample) else sample
             return [sample]
+        change = _change(self._newest, sample)
+        is_far = self._are_far(change, _NONE)
+        may_be_faulty = is_far or self._count < _MIN_SAMPLES or not isfinite(sum(change))
+        if may_be_faulty and value_fault(sample):
+            return [sample]
+        if sample.stamp_ns <= self._newest.stamp_ns:
+            return [sample]  # which is refused
         confirmed = []
         if self._suspect is not None:
+            if sample.stamp_ns <= self._suspect.stamp_ns:
+                self._report(sample.stamp_ns, EventKind.IMU_DUPLICATE_STAMP, "sample left out")
+                return []
             confirmed = self._judged(self._suspect, sample)
-            rate, force = _change(self._newest, sample)
-        if self._is_far(rate, force):
+            change = _change(self._newest, sample)
+            is_far = self._are_far(change, _NONE)
+        if is_far and sample.stamp_ns - self._newest.stamp_ns <= _MAX_STEP_NS:
             self._suspect = sample
             return confirmed
-        self._note(sample, rate, force)
+        self._note(sample, change)
         confirmed.append(sample)
         return confirmed
+
+    def end(self) -> list[ImuSample]:
+        """Return the sample that is held, as none follows that could judge it."""
+        suspect, self._suspect = self._suspect, None
+        return [] if suspect is None else [suspect]
 
     def _judged(self, suspect: ImuSample, after: ImuSample) -> list[ImuSample]:
         """Return a sample that is far from the one before, or nothing where it is far from the one after as well."""
         self._suspect, before = None, self._newest
         assert before is not None
-        rate, force = _change(before, suspect)
-        rate_after, force_after = _change(suspect, after)
-        is_near_in_time = after.stamp_ns - before.stamp_ns <= _MAX_NS
-        if is_near_in_time and self._is_far(min(rate, rate_after), min(force, force_after), *_change(before, after)):
+        into, out_of, past = _change(before, suspect), _change(suspect, after), _change(before, after)
+        neighbours = _largest(past, *self._last)
+        is_far = self._are_far((min(into[0], out_of[0]), min(into[1], out_of[1])), neighbours)
+        is_spike = is_far and after.stamp_ns - suspect.stamp_ns <= _MAX_STEP_NS
+        if is_spike and self._left_out < _MAX_LEFT_OUT:
+            self._left_out += _GAIN
             self._report(suspect.stamp_ns, EventKind.IMU_SPIKE, "far from the samples before and after: left out")
             return []
-        self._note(suspect, rate, force)
+        self._note(suspect, into)
         return [suspect]
 
-    def _is_far(self, rate: float, force: float, between_rates: float = 0.0, between_forces: float = 0.0) -> bool:
-        """Whether rate or force change by much more than they do in the mean, and than between neighbours."""
+    def _are_far(self, change: _Change, neighbours: _Change) -> bool:
+        """Whether rate or force change by much more than they do in the mean, and than neighbours do."""
         if self._count < _MIN_SAMPLES:
             return False
-        return rate > max(_MIN_RATE, _OVER_MEAN * self._rate_change, _OVER_NEIGHBOURS * between_rates) or force > max(
-            _MIN_FORCE, _OVER_MEAN * self._force_change, _OVER_NEIGHBOURS * between_forces
-        )
+        rate = max(_MIN_RATE, _OVER_MEAN * self._mean[0], _OVER_NEIGHBOURS * neighbours[0])
+        force = max(_MIN_FORCE, _OVER_MEAN * self._mean[1], _OVER_NEIGHBOURS * neighbours[1])
+        return change[0] > rate or change[1] > force
 
-    def _note(self, sample: ImuSample, rate: float, force: float) -> None:
+    def _note(self, sample: ImuSample, change: _Change) -> None:
         """Pass a sample on, with its change from the one before."""
         self._count += 1
         gain = max(1.0 / self._count, _GAIN)
-        self._rate_change += gain * (rate - self._rate_change)
-        self._force_change += gain * (force - self._force_change)
-        self._newest = sample
+        rate, force = self._mean
+        self._mean = rate + gain * (change[0] - rate), force + gain * (change[1] - force)
+        self._left_out -= _GAIN * self._left_out
+        self._newest, self._last = sample, (self._last[1], change)
 
 
-def _change(first: ImuSample, second: ImuSample) -> tuple[float, float]:
+def _change(first: ImuSample, second: ImuSample) -> _Change:
     """Return by how much angular velocity and specific force differ."""
     rate = dist(first.angular_velocity.tolist(), second.angular_velocity.tolist())
     return rate, dist(first.linear_acceleration.tolist(), second.linear_acceleration.tolist())
+
+
+def _largest(*changes: _Change) -> _Change:
+    """Return the largest change of rate and that of force."""
+    return max(rate for rate, _ in changes), max(force for _, force in changes)

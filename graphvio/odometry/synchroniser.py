@@ -70,14 +70,22 @@ class Synchroniser:
         """Take an IMU sample, and return those that are usable now, as they were measured but for their clock."""
         if self._clock_ns:
             sample = replace(sample, stamp_ns=sample.stamp_ns - self._clock_ns)
+        passed = [each for confirmed in self._sample_jumps.confirm(sample) for each in self._spikes.confirm(confirmed)]
+        return self._usable(passed)
+
+    def last_samples(self) -> list[ImuSample]:
+        """Return the samples that are usable now that no other follows."""
+        return self._usable(self._spikes.end())
+
+    def _usable(self, samples: list[ImuSample]) -> list[ImuSample]:
+        """Keep samples, and return those without a fault."""
         usable = []
-        for confirmed in self._sample_jumps.confirm(sample):
-            for each in self._spikes.confirm(confirmed):
-                fault = self._imu.add(each)
-                if fault:
-                    self._report(each.stamp_ns, fault, "sample left out")
-                else:
-                    usable.append(each)
+        for sample in samples:
+            fault = self._imu.add(sample)
+            if fault:
+                self._report(sample.stamp_ns, fault, "sample left out")
+            else:
+                usable.append(sample)
         return usable
 
     def corrected(self, sample: ImuSample) -> tuple[int, Float]:
