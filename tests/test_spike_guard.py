@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,21 @@ def test_samples_that_no_sensor_reads_are_left_to_others() -> None:
     passed, left_out = guarded(samples_of(readings))
     assert not left_out
     assert passed == list(range(80))
+
+
+@pytest.mark.parametrize(
+    ("later_ns", "kind"), [(0, EventKind.IMU_DUPLICATE_STAMP), (-STEP_NS // 2, EventKind.IMU_BACKWARD_STAMP)]
+)
+def test_sample_not_after_the_one_that_is_held_is_refused_by_its_kind(later_ns: int, kind: EventKind) -> None:
+    readings = standing(80)
+    readings[50:, 3] += 5.0  # sample 50 is held
+    samples, kinds = samples_of(readings), list[str]()
+    guard = SpikeGuard(lambda _, kind, __: kinds.append(kind))
+    for sample in samples[:51]:
+        guard.confirm(sample)
+    assert guard.confirm(replace(samples[50], stamp_ns=50 * STEP_NS + later_ns)) == []
+    assert kinds == [kind]
+    assert [each.stamp_ns for each in guard.confirm(samples[51])] == [50 * STEP_NS, 51 * STEP_NS]
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="the real recordings are not here")

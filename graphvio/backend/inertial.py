@@ -70,9 +70,12 @@ class ImuBuffer:
 
     def add(self, sample: ImuSample) -> str:
         """Take a sample, and return the kind of its fault if it is unusable, or an empty string."""
-        fault = value_fault(sample) or self.stamp_fault(sample)
+        fault = value_fault(sample)
         if fault:
             return fault
+        newest_ns = self.newest_ns
+        if newest_ns is not None and sample.stamp_ns <= newest_ns:
+            return EventKind.IMU_DUPLICATE_STAMP if sample.stamp_ns == newest_ns else EventKind.IMU_BACKWARD_STAMP
         if self._stuck.shows(sample):
             return EventKind.IMU_STUCK
         if self._end == len(self._stamps):
@@ -81,13 +84,6 @@ class ImuBuffer:
         self._values[self._end, :3], self._values[self._end, 3:] = sample.angular_velocity, sample.linear_acceleration
         self._end += 1
         return ""
-
-    def stamp_fault(self, sample: ImuSample) -> str:
-        """Return the kind of fault of a sample that is not newer than those before it, or an empty string."""
-        newest_ns = self.newest_ns
-        if newest_ns is None or sample.stamp_ns > newest_ns:
-            return ""
-        return EventKind.IMU_DUPLICATE_STAMP if sample.stamp_ns == newest_ns else EventKind.IMU_BACKWARD_STAMP
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether a sample at or after an instant has come."""

@@ -75,7 +75,7 @@ class Initialiser:
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
         self._fits_no_motion = False  # the window that was tested last
-        self._is_file_doubted, self._keyframes_in_doubt = False, 0
+        self._is_file_doubted, self._keyframes_in_doubt = False, 0  # by a window that fits; until the scale is known
         self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows
         self.reason = "no image has come"
         self.scale_sigma = np.inf  # of the window that was tested last, as a share

@@ -14,7 +14,6 @@ _MIN_SAMPLES, _GAIN = 20, 0.02  # of the mean change from sample to sample
 _MAX_STEP_NS = 8_000_000  # between samples: a real shock may be that short
 _MAX_LEFT_OUT = 0.1  # of the samples: what comes that often is measured
 
-
 _Change = tuple[float, float]  # of rate, rad/s, and force, m/s^2
 _NONE: _Change = (0.0, 0.0)
 
@@ -52,8 +51,10 @@ class SpikeGuard:
             return [sample]  # which is refused
         confirmed = []
         if self._suspect is not None:
-            if sample.stamp_ns <= self._suspect.stamp_ns:
-                self._report(sample.stamp_ns, EventKind.IMU_DUPLICATE_STAMP, "sample left out")
+            if sample.stamp_ns <= self._suspect.stamp_ns:  # it would be taken before the one that is held
+                is_copy = sample.stamp_ns == self._suspect.stamp_ns
+                kind = EventKind.IMU_DUPLICATE_STAMP if is_copy else EventKind.IMU_BACKWARD_STAMP
+                self._report(sample.stamp_ns, kind, "sample left out")
                 return []
             confirmed = self._judged(self._suspect, sample)
             change = _change(self._newest, sample)
