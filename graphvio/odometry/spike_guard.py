@@ -14,6 +14,7 @@ _MIN_SAMPLES, _GAIN = 20, 0.02  # of the mean change from sample to sample
 _MAX_STEP_NS = 8_000_000  # between samples: a real shock may be that short
 _MAX_LEFT_OUT = 0.1  # of the samples: what comes that often is measured
 
+_Readings = tuple[list[float], list[float]]  # rate and force
 _Change = tuple[float, float]  # of rate, rad/s, and force, m/s^2
 _NONE: _Change = (0.0, 0.0)
 
@@ -32,6 +33,7 @@ class SpikeGuard:
     def __init__(self, report: Report) -> None:
         self._report = report
         self._newest: ImuSample | None = None  # of those that were passed on
+        self._readings: _Readings = ([], [])  # its, as numpy is slow for three
         self._suspect: ImuSample | None = None
         self._mean: _Change = _NONE  # change from sample to sample
         self._last: tuple[_Change, _Change] = (_NONE, _NONE)
@@ -39,10 +41,12 @@ class SpikeGuard:
 
     def confirm(self, sample: ImuSample) -> list[ImuSample]:
         """Take a sample, and return those that may be used now, in time order, with those that no sensor reads."""
+        readings = _readings(sample)
         if self._newest is None:
-            self._newest = None if value_fault(sample) else sample
+            if not value_fault(sample):
+                self._newest, self._readings = sample, readings
             return [sample]
-        change = _change(self._newest, sample)
+        change = _change(self._readings, readings)
         is_far = self._are_far(change, _NONE)
         may_be_faulty = is_far or self._count < _MIN_SAMPLES or not isfinite(sum(change))
         if may_be_faulty and value_fault(sample):
@@ -57,12 +61,12 @@ class SpikeGuard:
                 self._report(sample.stamp_ns, kind, "sample left out")
                 return []
             confirmed = self._judged(self._suspect, sample)
-            change = _change(self._newest, sample)
+            change = _change(self._readings, readings)
             is_far = self._are_far(change, _NONE)
         if is_far and sample.stamp_ns - self._newest.stamp_ns <= _MAX_STEP_NS:
             self._suspect = sample
             return confirmed
-        self._note(sample, change)
+        self._note(sample, readings, change)
         confirmed.append(sample)
         return confirmed
 
@@ -73,9 +77,10 @@ class SpikeGuard:
 
     def _judged(self, suspect: ImuSample, after: ImuSample) -> list[ImuSample]:
         """Return a sample that is far from the one before, or nothing where it is far from the one after as well."""
-        self._suspect, before = None, self._newest
-        assert before is not None
-        into, out_of, past = _change(before, suspect), _change(suspect, after), _change(before, after)
+        self._suspect = None
+        readings, next_ones = _readings(suspect), _readings(after)
+        into, out_of = _change(self._readings, readings), _change(readings, next_ones)
+        past = _change(self._readings, next_ones)
         neighbours = _largest(past, *self._last)
         is_far = self._are_far((min(into[0], out_of[0]), min(into[1], out_of[1])), neighbours)
         is_spike = is_far and after.stamp_ns - suspect.stamp_ns <= _MAX_STEP_NS
@@ -83,7 +88,7 @@ class SpikeGuard:
             self._left_out += _GAIN
             self._report(suspect.stamp_ns, EventKind.IMU_SPIKE, "far from the samples before and after: left out")
             return []
-        self._note(suspect, into)
+        self._note(suspect, readings, into)
         return [suspect]
 
     def _are_far(self, change: _Change, neighbours: _Change) -> bool:
@@ -94,20 +99,23 @@ class SpikeGuard:
         force = max(_MIN_FORCE, _OVER_MEAN * self._mean[1], _OVER_NEIGHBOURS * neighbours[1])
         return change[0] > rate or change[1] > force
 
-    def _note(self, sample: ImuSample, change: _Change) -> None:
-        """Pass a sample on, with its change from the one before."""
+    def _note(self, sample: ImuSample, readings: _Readings, change: _Change) -> None:
+        """Pass a sample on, with its readings and their change from the ones before."""
         self._count += 1
         gain = max(1.0 / self._count, _GAIN)
         rate, force = self._mean
         self._mean = rate + gain * (change[0] - rate), force + gain * (change[1] - force)
         self._left_out -= _GAIN * self._left_out
-        self._newest, self._last = sample, (self._last[1], change)
+        self._newest, self._readings, self._last = sample, readings, (self._last[1], change)
 
 
-def _change(first: ImuSample, second: ImuSample) -> _Change:
+def _readings(sample: ImuSample) -> _Readings:
+    return sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()
+
+
+def _change(first: _Readings, second: _Readings) -> _Change:
     """Return by how much angular velocity and specific force differ."""
-    rate = dist(first.angular_velocity.tolist(), second.angular_velocity.tolist())
-    return rate, dist(first.linear_acceleration.tolist(), second.linear_acceleration.tolist())
+    return dist(first[0], second[0]), dist(first[1], second[1])
 
 
 def _largest(*changes: _Change) -> _Change:
