@@ -660,12 +660,13 @@ def test_read_ahead_is_bounded_and_in_order() -> None:
 
 
 def test_read_ahead_works_while_its_consumer_does() -> None:
-    results = read_ahead(lambda item: time.sleep(0.02), range(10), depth=4, threads=2)
+    begun = threading.Semaphore(0)
+    results = read_ahead(lambda _: begun.release(), range(10), depth=4, threads=2)
     next(results)
-    begun = time.perf_counter()
-    for _ in results:
-        time.sleep(0.02)  # an estimation that is slower than two threads' decoding
-    assert time.perf_counter() - begun < 9 * 0.02 + 0.15
+    for _ in range(1 + 4):  # the consumer asks for nothing meanwhile
+        assert begun.acquire(timeout=30.0)
+    list(results)
+    assert ended()
 
 
 def test_read_ahead_raises_errors_in_order() -> None:

@@ -167,20 +167,16 @@ def test_calibration_is_logged_with_its_standard_deviations(tmp_path: Path) -> N
     assert found["/calibration/IMU__time_offset/value"][0] == pytest.approx([0.0, -2.0, 2.0])
 
 
-def test_show_returns_at_once_while_logging_is_slow(tmp_path: Path, monkeypatch: Any) -> None:
+def test_show_returns_while_logging_is_blocked(tmp_path: Path, monkeypatch: Any) -> None:
     from graphvio.viewer.recording import Recording
 
-    monkeypatch.setattr(Recording, "add_images", lambda *_: time.sleep(0.2))
-    spent_ms = []
-    frames = [frameset(k) for k in range(100)]
+    every_frame_shown = threading.Event()
+    monkeypatch.setattr(Recording, "add_images", lambda *_: every_frame_shown.wait(20.0))
     with Viewer(some_rig(), save=tmp_path / "slow.rrd") as viewer:
-        for k, frame in enumerate(frames):
-            began = time.perf_counter()
-            viewer.show(frame, estimate(k))
-            spent_ms.append(1e3 * (time.perf_counter() - began))
-            time.sleep(0.002)
-        assert viewer.dropped > 80
-    assert np.median(spent_ms) < 0.3
+        for k in range(100):
+            viewer.show(frameset(k), estimate(k))
+        assert viewer.dropped in (98, 99)  # all but the newest, and one that the worker may have
+        every_frame_shown.set()
     assert rows_of(tmp_path / "slow.rrd")["/timing/track"] == 100
 
 
