@@ -40,7 +40,7 @@ from graphvio.monocular.marginalisation import without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkNames, Landmarks
 from graphvio.monocular.states import Prior, States, first_prior
-from graphvio.monocular.structure import Eliminated, Structure, located
+from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.self_calibration.findings import Finding, findings
@@ -330,9 +330,15 @@ class Problem(NamedTuple):
     prior: Prior
 
 
-def problem(n_keyframes: int = 5, is_exact: bool = False, shares: bool = False, calibrates: bool = False) -> Problem:
+def problem(
+    n_keyframes: int = 5,
+    is_exact: bool = False,
+    shares: bool = False,
+    calibrates: bool = False,
+    flight: Flight | None = None,
+) -> Problem:
     """A window around the truth, of one camera or of two whose views overlap, with or without unknown calibration."""
-    rig, flight, rng = overlapping_rig() if shares else single_rig(), moving(), np.random.default_rng(2)
+    rig, flight, rng = overlapping_rig() if shares else single_rig(), flight or moving(), np.random.default_rng(2)
     assert rig.imu is not None
     times = np.arange(n_keyframes) * 0.15
     stamps = np.round(times * 1e9).astype(np.int64)
@@ -497,6 +503,51 @@ def test_first_guess_in_motion_finds_velocity_gravity_and_gyro_bias() -> None:
     np.testing.assert_allclose(guess.gyro_bias, GYRO_BIAS, atol=5e-3)
     assert np.rad2deg(np.arccos(guess.gravity @ body_R_nav @ truth.gravity / GRAVITY_M_S2**2)) < 2.0
     np.testing.assert_allclose(guess.velocities[0], body_R_nav @ truth.velocities[0], atol=0.15)
+
+
+def test_first_guess_of_a_vehicle_that_speeds_up_evenly_is_not_a_standstill() -> None:
+    """Its acceleration looks like a tilt, with which everything is close by and nothing moves."""
+    car = Flight(
+        lambda t: np.array([6.0 * t + 2.0 * t**2, 0.0, 0.01 * np.sin(9.0 * t)]),
+        lambda t: np.array([0.004 * np.sin(8.0 * t), 0.006 * np.sin(7.0 * t), 0.01 * np.sin(t)]),
+    )
+    measured, truth, _, _ = problem(14, is_exact=True, flight=car)
+    guess = first_guess(measured.samples, measured.structure, measured.cameras, np.zeros(3))
+    assert 0.8 < guess.poses[-1, 0, 3] / truth.poses[-1, 0, 3] < 1.25
+
+
+def test_step_that_scales_all_motions_leaves_the_views_as_they_are() -> None:
+    measured, states, landmarks, _ = problem(12, is_exact=True)
+    n, eliminated = len(states.poses), Eliminated.empty(measured.structure)
+    before = visual_cost(measured, states, landmarks, eliminated)
+    of_cameras = states.poses @ measured.cameras.body_T_cam[0]
+    shifts = np.einsum("kji,kj->ki", states.poses[:, :3, :3], 0.25 * of_cameras[:, :3, 3])
+    step = np.column_stack([np.zeros((n, 3)), shifts]).ravel()
+    moved = states.moved(np.concatenate([step, np.zeros(3 * n + 9)]))
+    after = landmarks_after(
+        landmarks, measured.structure, measured.cameras, states.poses, moved.poses, eliminated, step
+    )
+    assert visual_cost(measured, moved, after, eliminated) == pytest.approx(before, rel=0.02)
+
+
+def visual_cost(measured: Measurements, states: States, landmarks: Float, eliminated: Eliminated) -> float:
+    return float(
+        visual_equations(states.poses, measured.cameras, landmarks, measured.structure, 2.0, 1e4, eliminated)[2]
+    )
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_adjustment_from_a_wrong_scale_finds_the_true_one_in_few_steps(factor: float) -> None:
+    measured, states, landmarks, prior = problem(12, is_exact=True)
+    poses, frames = states.poses.copy(), measured.structure.odom_T_landmark.copy()
+    poses[:, :3, 3] *= factor
+    frames[:, :3, 3] *= factor
+    scaled = measured._replace(structure=measured.structure._replace(odom_T_landmark=frames))
+    start = replace(states, poses=poses, velocities=factor * states.velocities)
+    places = landmarks * np.array([1.0, 1.0, 1.0 / factor])
+    costs = [adjust(scaled, start, places, prior, steps).equations.cost for steps in (5, 40)]
+    assert costs[0] < 1.003 * costs[1]
+    assert costs[1] == pytest.approx(adjust(measured, states, landmarks, prior, 40).equations.cost, rel=1e-3)
 
 
 # ------------------------------------------------------------------ the estimator

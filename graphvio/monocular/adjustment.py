@@ -149,7 +149,10 @@ def adjust(
             raise np.linalg.LinAlgError("the window's solution is not finite")
         moved = states.moved(step)
         of_views = step[visual_columns(n, states.n_cameras, len(step) - 9 * n - GRAVITY - BIASES)]
-        shifted = landmarks_after(landmarks, measured.structure, at.eliminated, of_views, n)
+        shifted = landmarks_after(
+            landmarks, measured.structure, states.cameras(measured.cameras), states.poses, moved.poses, at.eliminated,
+            of_views,
+        )  # fmt: skip
         new = equations(measured, moved, shifted, prior, file)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:

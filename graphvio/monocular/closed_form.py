@@ -4,6 +4,10 @@ With the rotations of the gyro, each ray to a landmark is one linear equation of
 keyframe and of the landmark's distance: A. Martinelli, *Closed-form solution of visual-inertial structure from motion*,
 IJCV 106(2), 2014. The gyro's bias is the one for which the equations fit best: J. Kaiser et al., *Simultaneous state
 initialization and gyroscope bias calibration in visual inertial aided navigation*, RA-L 2(1), 2017.
+
+In metres the equations have an attractive wrong solution: with small distances and no motion all errors are small. A
+vehicle that accelerates evenly is found there, its acceleration taken for a tilt. The unit of length is therefore the
+motion itself, and the length of a metre is one of the unknowns.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.linear_algebra import product, solve_symmetric
+from graphvio.linear_algebra import cholesky, eigen, product, solve_lower, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.structure import Structure
@@ -25,9 +29,10 @@ from graphvio.self_calibration.preintegration import preintegrate
 _ROUNDS = 8
 _BIAS_STEP = 1e-4  # rad/s, of the numerical derivatives
 _MAX_BIAS_STEP = 0.05
-_CONVERGED = 1e-5
+_CONVERGED = 5e-3  # rad/s: the adjustment that follows is exact
 _ROBUST_SCALE = 3.0  # of the Cauchy weights, in medians of the errors
 _LENGTH_ROUNDS = 4
+_MIN_DISTANCE = 1e-2  # of a landmark, in lengths of the motion
 _BIAS_SIGMA = 0.1  # rad/s, known beforehand
 _ANGLE_SIGMA = 2e-3  # of a ray, rad, against that
 
@@ -57,10 +62,42 @@ class _Chain(NamedTuple):
     positions: Float
 
 
-class _Fit(NamedTuple):
-    motion: Float  # (6,) velocity and gravity
-    distances: Float  # (L,)
-    errors: Float  # (N, 3) weighted
+class _Views(NamedTuple):
+    """N views of L landmarks, sorted by landmark; a point that several cameras see is a landmark of each.
+
+    What cameras see of each other's points would give the scale, but by a rig file that is wrong any scale.
+    """
+
+    state: Int  # (N,)
+    landmark: Int  # (N,)
+    firsts: Int  # (L,) first view of each
+    rays: Float  # (N, 3) of unit length, in body
+    levers: Float  # (N, 3) m, of the cameras in body
+    weights: Float  # (N,)
+
+    @staticmethod
+    def of(structure: Structure, cameras: Cameras) -> _Views:
+        n_cameras = len(cameras.body_T_cam)
+        point = np.repeat(np.arange(len(structure.odom_T_landmark)), np.diff(structure.rows))
+        _, landmark, counts = np.unique(point * n_cameras + structure.camera, return_inverse=True, return_counts=True)
+        rows = np.argsort(landmark, kind="stable")
+        rows = rows[counts[landmark[rows]] > 1]
+        _, firsts, landmark = np.unique(landmark[rows], return_index=True, return_inverse=True)
+        rays = np.column_stack([structure.rays[rows], np.ones(len(rows))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        body_T_cam = cameras.body_T_cam[structure.camera[rows]]
+        in_body = np.einsum("nij,nj->ni", body_T_cam[:, :3, :3], rays)
+        return _Views(structure.state[rows], landmark, firsts, in_body, body_T_cam[:, :3, 3], np.ones(len(rows)))
+
+
+class _Equations(NamedTuple):
+    """Linear equations of the motion ``[velocity, gravity, length of a metre]`` (7,) and of the distances (L,)."""
+
+    by_motion: Float  # (N, 3, 7)
+    by_distance: Float  # (N, 3)
+    gain: Float  # (L, 7): the best distances are ``-gain @ motion``
+    normal: Float  # (7, 7) of the motion, with the best distances
+    length: Float  # (7, 7): ``motion @ length @ motion`` is the squared length of the keyframes' positions
 
 
 def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras, gyro_bias: Float) -> FirstGuess:
@@ -76,45 +113,72 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
         MeasurementError: if the samples do not cover the keyframes.
         numpy.linalg.LinAlgError: if the motion determines nothing.
     """
-    n_views = len(structure.state)
-    rays = np.column_stack([structure.rays, np.ones(n_views)])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    landmark = np.repeat(np.arange(len(structure.odom_T_landmark)), np.diff(structure.rows))
-    in_body = np.einsum("nij,nj->ni", cameras.body_T_cam[structure.camera, :3, :3], rays)
-    levers = cameras.body_T_cam[structure.camera, :3, 3]
-    weights, bias = np.ones(n_views), gyro_bias.copy()
-
-    def fit(bias: Float) -> _Fit:
-        return _fit(_chain(samples, bias), structure, landmark, in_body, levers, weights)
-
+    views, bias = _Views.of(structure, cameras), gyro_bias.copy()
     for _ in range(_ROUNDS):
-        at = fit(bias)
-        distances = np.maximum(np.abs(at.distances), 1e-2)[landmark]
-        angles = np.linalg.norm(at.errors, axis=1) / weights / distances
-        scale = _ROBUST_SCALE * max(float(np.median(angles)), 1e-5)
-        weights = 1.0 / (distances * (1.0 + (angles / scale) ** 2) ** 0.5)
-        at = fit(bias)
-        columns = [(fit(bias + _BIAS_STEP * axis).errors - at.errors).ravel() / _BIAS_STEP for axis in np.eye(3)]
-        jacobian = np.column_stack(columns)
-        held = (_ANGLE_SIGMA / _BIAS_SIGMA) ** 2
-        normal = product(jacobian.T.copy(), np.column_stack([jacobian, at.errors.ravel()]))
-        step = -_solved(normal[:, :3] + held * np.eye(3), normal[:, 3] + held * (bias - gyro_bias))
+        views = _reweighted(views, _equations(_chain(samples, bias), views))
+        step = _bias_step(samples, views, bias, gyro_bias)
         bias = bias + step * min(1.0, _MAX_BIAS_STEP / max(float(np.linalg.norm(step)), 1e-12))
         if np.linalg.norm(step) < _CONVERGED:
             break
     chain = _chain(samples, bias)
-    motion = _fit(chain, structure, landmark, in_body, levers, weights).motion
-    gravity = motion[3:]
-    for _ in range(_LENGTH_ROUNDS):
-        gravity = gravity * (GRAVITY_M_S2 / np.linalg.norm(gravity))
-        across = np.linalg.svd(gravity[None])[2][1:].T  # (3, 2)
-        motion = _fit(chain, structure, landmark, in_body, levers, weights, (gravity, across)).motion
-        gravity = motion[3:]
+    velocity, gravity = _metric_motion(chain, views)
     times = chain.times[:, None]
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, :3, :3] = chain.rotations
-    poses[:, :3, 3] = times * motion[:3] + 0.5 * times**2 * gravity + chain.positions
-    return FirstGuess(poses, motion[:3] + times * gravity + chain.velocities, gravity, bias)
+    poses[:, :3, 3] = times * velocity + 0.5 * times**2 * gravity + chain.positions
+    return FirstGuess(poses, velocity + times * gravity + chain.velocities, gravity, bias)
+
+
+def _reweighted(views: _Views, at: _Equations) -> _Views:
+    """Weight views such that errors are angles, and those of mismatches count little."""
+    motion = _shortest(at.normal, at.length)
+    distances = np.maximum(np.abs(at.gain @ motion), _MIN_DISTANCE)[views.landmark]
+    angles = np.linalg.norm(_errors(at, views, motion), axis=1) / views.weights / distances
+    scale = _ROBUST_SCALE * max(float(np.median(angles)), 1e-5)
+    return views._replace(weights=1.0 / (distances * (1.0 + (angles / scale) ** 2) ** 0.5))
+
+
+def _bias_step(samples: InertialSamples, views: _Views, bias: Float, known_bias: Float) -> Float:
+    """Return the step (3,) rad/s of Gauss and Newton from a gyro bias to the one for which the equations fit best."""
+
+    def errors(bias: Float) -> Float:
+        at = _equations(_chain(samples, bias), views)
+        return _errors(at, views, _shortest(at.normal, at.length)).ravel()
+
+    at = errors(bias)
+    jacobian = np.column_stack([(errors(bias + _BIAS_STEP * axis) - at) / _BIAS_STEP for axis in np.eye(3)])
+    held = (_ANGLE_SIGMA / _BIAS_SIGMA) ** 2
+    normal = product(jacobian.T.copy(), np.column_stack([jacobian, at]))
+    step = solve_symmetric(normal[:, :3] + held * np.eye(3), normal[:, 3] + held * (bias - known_bias))
+    if not np.isfinite(step).all():
+        raise np.linalg.LinAlgError("the images show too little motion")
+    return -step
+
+
+def _metric_motion(chain: _Chain, views: _Views) -> tuple[Float, Float]:
+    """Return velocity (3,) m/s and gravity (3,) m/s^2 of its known length, in body at the first keyframe.
+
+    The direction of gravity is sought from that of the equations without its length, and from that of the mean specific
+    force: the former is undetermined where the body accelerates evenly and does not turn.
+    """
+    at = _equations(chain, views)
+
+    def motion(gravity: Float, across: Float) -> Float:
+        """Return the best motion whose gravity is a given one, in metres, and any sum of others across it (3, A)."""
+        basis = np.zeros((7, 4 + across.shape[1]))
+        basis[:3, :3], basis[3:6, 3:-1], basis[3:6, -1], basis[6, -1] = np.eye(3), across, gravity, 1.0
+        return basis @ _shortest(basis.T @ at.normal @ basis, basis.T @ at.length @ basis)
+
+    found = []
+    for gravity in (_shortest(at.normal, at.length)[3:6], -chain.velocities[-1]):
+        for _ in range(_LENGTH_ROUNDS):
+            gravity = gravity * (GRAVITY_M_S2 / np.linalg.norm(gravity))
+            found.append(motion(gravity, np.zeros((3, 0))))
+            gravity = motion(gravity, np.linalg.svd(gravity[None])[2][1:].T)[3:6]
+    best = min(found, key=lambda each: float(each @ at.normal @ each))
+    if best[6] == 0.0:
+        raise np.linalg.LinAlgError("the images show too little motion")
+    return best[:3] / best[6], best[3:6] / best[6]
 
 
 def _chain(samples: InertialSamples, gyro_bias: Float) -> _Chain:
@@ -138,59 +202,46 @@ def _chain(samples: InertialSamples, gyro_bias: Float) -> _Chain:
     return _Chain((stamps - stamps[0]) * 1e-9, np.array(rotations), np.array(velocities), np.array(positions))
 
 
-def _fit(
-    chain: _Chain,
-    structure: Structure,
-    landmark: Int,
-    in_body: Float,
-    levers: Float,
-    weights: Float,
-    gravity: tuple[Float, Float] | None = None,
-) -> _Fit:
-    """Solve the linear equations by least squares; with gravity (3,) and two directions across it, only for these."""
-    k, first = structure.state, structure.rows[:-1]
-    rays = np.einsum("nij,nj->ni", chain.rotations[k], in_body)
-    at = chain.positions[k] + np.einsum("nij,nj->ni", chain.rotations[k], levers)
-    k_first, d_first = k[first][landmark], rays[first][landmark]
-    apart = at[first][landmark] - at
-    dt = chain.times[k_first] - chain.times[k]
-    dt2 = 0.5 * (chain.times[k_first] ** 2 - chain.times[k] ** 2)
-    across = weights[:, None, None] * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
-    by_motion = np.concatenate([across * dt[:, None, None], across * dt2[:, None, None]], axis=2)
-    constant = np.einsum("nij,nj->ni", across, apart)
-    if gravity is not None:
-        by_gravity = by_motion[:, :, 3:]
-        constant = constant + np.einsum("nij,j->ni", by_gravity, gravity[0])
-        by_motion = np.concatenate([by_motion[:, :, :3], np.einsum("nij,jk->nik", by_gravity, gravity[1])], axis=2)
-    by_distance = np.einsum("nij,nj->ni", across, d_first)
-    n = len(structure.odom_T_landmark)
-    size = by_motion.shape[2]
+def _equations(chain: _Chain, views: _Views) -> _Equations:
+    """Collect the equations, each weighted, of the views of a motion with given rotations."""
+    k, first, weights = views.state, views.firsts[views.landmark], views.weights[:, None, None]
+    rays = np.einsum("nij,nj->ni", chain.rotations[k], views.rays)
+    places = chain.positions[k] + np.einsum("nij,nj->ni", chain.rotations[k], views.levers)
+    dt, dt2 = chain.times[k[first]] - chain.times[k], 0.5 * (chain.times[k[first]] ** 2 - chain.times[k] ** 2)
+    across = weights * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
+    metre = np.einsum("nij,nj->ni", across, places[first] - places)[:, :, None]
+    by_motion = np.concatenate([across * dt[:, None, None], across * dt2[:, None, None], metre], axis=2)
+    by_distance = np.einsum("nij,nj->ni", across, rays[first])
 
     def of_landmarks(values: Float) -> Float:
-        return np.asarray(np.add.reduceat(values, first, axis=0))
+        return np.asarray(np.add.reduceat(values, views.firsts, axis=0))
 
-    s = of_landmarks((by_distance**2).sum(axis=1)) + 1e-12
-    r = of_landmarks(np.einsum("nij,ni->nj", by_motion, by_distance))
-    h = of_landmarks((by_distance * constant).sum(axis=1))
-    of_depths = product((r / s[:, None]).T.copy(), np.column_stack([r, h]))
-    normal = np.einsum("nij,nik->jk", by_motion, by_motion) - of_depths[:, :-1]
-    right = np.einsum("nij,ni->j", by_motion, constant) - of_depths[:, -1]
-    solution = -_solved(normal + 1e-12 * np.trace(normal) * np.eye(size), right)
-    distances = -(h + np.einsum("lj,j->l", r, solution)) / s
-    errors = np.einsum("nij,j->ni", by_motion, solution) + by_distance * distances[landmark][:, None] + constant
-    if gravity is not None:
-        solution = np.concatenate([solution[:3], gravity[0] + gravity[1] @ solution[3:]])
-    assert len(distances) == n
-    return _Fit(solution, distances, errors)
+    gain = of_landmarks(np.einsum("nij,ni->nj", by_motion, by_distance))
+    own = of_landmarks((by_distance**2).sum(axis=1))[:, None] + 1e-12
+    normal = np.einsum("nij,nik->jk", by_motion, by_motion) - product((gain / own).T.copy(), gain)
+    times = chain.times[:, None, None] * np.eye(3)
+    positions = np.concatenate([times, 0.5 * chain.times[:, None, None] * times, chain.positions[:, :, None]], axis=2)
+    return _Equations(by_motion, by_distance, gain / own, normal, np.einsum("kij,kim->jm", positions, positions))
 
 
-def _solved(matrix: Float, right: Float) -> Float:
-    """Solve positive definite equations.
+def _errors(at: _Equations, views: _Views, motion: Float) -> Float:
+    """Return the weighted errors (N, 3) of a motion (7,)."""
+    distances = -(at.gain @ motion)[views.landmark]
+    return np.asarray(np.einsum("nij,j->ni", at.by_motion, motion) + at.by_distance * distances[:, None])
+
+
+def _shortest(matrix: Float, norm: Float) -> Float:
+    """Return the vector x (M,) with the smallest ``x matrix x`` of those with ``x norm x = 1``; its last is positive.
 
     Raises:
-        numpy.linalg.LinAlgError: if the matrix is singular.
+        numpy.linalg.LinAlgError: if there is none.
     """
-    solution = solve_symmetric(matrix, right)
-    if not np.isfinite(solution).all():
+    lower = cholesky(matrix + 1e-12 * np.trace(matrix) * np.eye(len(matrix)))
+    whitened = solve_lower(lower, solve_lower(lower, norm).T.copy())
+    values, vectors = eigen(0.5 * (whitened + whitened.T))
+    largest = int(np.argmax(values))
+    if not values[largest] > 0.0:
         raise np.linalg.LinAlgError("the images show too little motion")
-    return solution
+    upper_inverse = solve_lower(lower, np.eye(len(matrix)))
+    shortest = product(upper_inverse, vectors[:, largest : largest + 1].copy())[:, 0] / np.sqrt(values[largest])
+    return shortest * np.copysign(1.0, shortest[-1])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.geometry import rotate, se3_compose, se3_inverse
 from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import (
     COLUMNS,
@@ -27,6 +28,7 @@ PRIOR_INVERSE_DEPTH = 0.2
 PRIOR_INFORMATION = 1e-2  # of an inverse depth, known to 10 / m: more would pull the scale of all landmarks
 _STEPS = 6
 _LOCATED = 1e-9  # a smaller step ends the search of a landmark's place: it is less than a millionth of a pixel
+_MAX_NEARER = 0.5  # step of an inverse depth, relative, that is taken as one of the depth
 _FEW = 5  # views, of a landmark that is located again before the window is linearised
 
 
@@ -78,10 +80,26 @@ class Eliminated(NamedTuple):
 
 @kernel
 def landmarks_after(
-    landmarks: Float, structure: Structure, eliminated: Eliminated, step: Float, n_states: int
-) -> Float:
-    """Return the landmarks (L, 3) after a step (6 K + n,) of K states' poses and n parameters of cameras."""
-    moved, b, n_poses = landmarks.copy(), np.zeros(3), POSE * n_states
+    landmarks: Float, structure: Structure, cameras: Cameras, poses: Float, moved_poses: Float, eliminated: Eliminated,
+    step: Float,
+) -> Float:  # fmt: skip
+    """Return the landmarks (L, 3) after a step of the poses and cameras.
+
+    A landmark moves along with the camera that sees it first, and the step changes its direction and distance there. So
+    all distances and baselines may become larger by the same factor, and no view changes: for a landmark that stays in
+    its fixed frame, views are off by the square of the step, and the scale is found in steps of a few percent.
+
+    Args:
+        landmarks: (L, 3) before.
+        structure: of the views.
+        cameras: of the rig, before.
+        poses: (K, 4, 4) ``odom_T_body``, before.
+        moved_poses: (K, 4, 4) after.
+        eliminated: what the elimination of the landmarks left behind.
+        step: (6 K + n,) of the poses and of n parameters of cameras.
+    """
+    n_poses = POSE * len(poses)
+    moved, b, by = np.empty_like(landmarks), np.zeros(3), np.zeros(3)
     for point in range(len(landmarks)):
         for r in range(3):
             b[r] = eliminated.gradient[point, r]
@@ -91,9 +109,53 @@ def landmarks_after(
             for c in range(eliminated.by_cameras.shape[2]):
                 b[r] += eliminated.by_cameras[point, r, c] * step[n_poses + c]
         for r in range(3):
+            by[r] = 0.0
             for c in range(3):
-                moved[point, r] -= eliminated.inverse[point, r, c] * b[c]
+                by[r] -= eliminated.inverse[point, r, c] * b[c]
+        first = structure.rows[point]
+        state, frame = structure.state[first], structure.odom_T_landmark[point]
+        body_T_cam = cameras.body_T_cam[structure.camera[first]]
+        cam_T_frame = se3_compose(se3_inverse(se3_compose(poses[state], body_T_cam)), frame)
+        frame_T_moved = se3_compose(se3_inverse(frame), se3_compose(moved_poses[state], body_T_cam))
+        body_step = step[POSE * state : POSE * state + POSE]
+        _move_with_camera(landmarks[point], by, cam_T_frame, frame_T_moved, body_T_cam, body_step, moved[point])
     return moved
+
+
+@kernel
+def _move_with_camera(
+    landmark: Float, by: Float, cam_T_frame: Float, frame_T_moved: Float, body_T_cam: Float, step: Float, moved: Float
+) -> None:
+    """Fill in the landmark (3,) after its own step (3,) and that of a body with a camera (6,)."""
+    w, rotation, place = landmark[2], cam_T_frame[:3, :3], cam_T_frame[:3, 3]
+    at, by_body, change = np.empty(3), np.empty(3), np.empty(3)
+    for r in range(3):
+        at[r] = rotation[r, 0] * landmark[0] + rotation[r, 1] * landmark[1] + rotation[r, 2] + w * place[r]
+    from_body = rotate(body_T_cam[:3, :3], at)
+    for r in range(3):
+        from_body[r] += w * body_T_cam[r, 3]
+    for r in range(3):
+        next_r, last_r = (r + 1) % 3, (r + 2) % 3
+        by_body[r] = step[next_r] * from_body[last_r] - step[last_r] * from_body[next_r] + w * step[3 + r]
+    by_body = rotate(body_T_cam[:3, :3].T, by_body)
+    for r in range(3):
+        change[r] = rotation[r, 0] * by[0] + rotation[r, 1] * by[1] + by[2] * place[r] - by_body[r]
+    x, y, inverse_depth = at[0] / at[2], at[1] / at[2], w / at[2]
+    x += (change[0] - x * change[2]) / at[2]
+    y += (change[1] - y * change[2]) / at[2]
+    nearer = (by[2] - inverse_depth * change[2]) / at[2]
+    if inverse_depth > 0.0 and nearer < _MAX_NEARER * inverse_depth:
+        inverse_depth /= 1.0 - nearer / inverse_depth  # a step of the depth
+    else:
+        inverse_depth += nearer
+    for r in range(3):
+        change[r] = frame_T_moved[r, 0] * x + frame_T_moved[r, 1] * y + frame_T_moved[r, 2]
+        change[r] += inverse_depth * frame_T_moved[r, 3]
+    if at[2] > 0.0 and change[2] > 0.0:
+        moved[0], moved[1], moved[2] = change[0] / change[2], change[1] / change[2], inverse_depth / change[2]
+    else:  # behind a camera
+        for r in range(3):
+            moved[r] = landmark[r] + by[r]
 
 
 @kernel
