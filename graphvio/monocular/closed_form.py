@@ -32,6 +32,7 @@ _MAX_BIAS_STEP = 0.05
 _CONVERGED = 5e-3  # rad/s: the adjustment that follows is exact
 _ROBUST_SCALE = 3.0  # of the Cauchy weights, in medians of the errors
 _LENGTH_ROUNDS = 4
+_MIN_LANDMARKS = 8
 _MIN_DISTANCE = 1e-2  # of a landmark, in lengths of the motion
 _BIAS_SIGMA = 0.1  # rad/s, known beforehand
 _ANGLE_SIGMA = 2e-3  # of a ray, rad, against that
@@ -114,6 +115,8 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
         numpy.linalg.LinAlgError: if the motion determines nothing.
     """
     views, bias = _Views.of(structure, cameras), gyro_bias.copy()
+    if len(views.firsts) < _MIN_LANDMARKS:
+        raise np.linalg.LinAlgError("the images show too little motion")
     for _ in range(_ROUNDS):
         views = _reweighted(views, _equations(_chain(samples, bias), views))
         step = _bias_step(samples, views, bias, gyro_bias)
@@ -172,7 +175,10 @@ def _metric_motion(chain: _Chain, views: _Views) -> tuple[Float, Float]:
     found = []
     for gravity in (_shortest(at.normal, at.length)[3:6], -chain.velocities[-1]):
         for _ in range(_LENGTH_ROUNDS):
-            gravity = gravity * (GRAVITY_M_S2 / np.linalg.norm(gravity))
+            norm = float(np.linalg.norm(gravity))
+            if norm == 0.0:
+                raise np.linalg.LinAlgError("the accelerometer shows no gravity")
+            gravity = gravity * (GRAVITY_M_S2 / norm)
             found.append(motion(gravity, np.zeros((3, 0))))
             gravity = motion(gravity, np.linalg.svd(gravity[None])[2][1:].T)[3:6]
     best = min(found, key=lambda each: float(each @ at.normal @ each))
@@ -244,4 +250,4 @@ def _shortest(matrix: Float, norm: Float) -> Float:
         raise np.linalg.LinAlgError("the images show too little motion")
     upper_inverse = solve_lower(lower, np.eye(len(matrix)))
     shortest = product(upper_inverse, vectors[:, largest : largest + 1].copy())[:, 0] / np.sqrt(values[largest])
-    return shortest * np.copysign(1.0, shortest[-1])
+    return np.asarray(shortest * np.copysign(1.0, shortest[-1]))
