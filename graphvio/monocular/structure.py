@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.geometry import rotate, se3_compose, se3_inverse
 from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import (
     COLUMNS,
@@ -99,7 +98,7 @@ def landmarks_after(
         step: (6 K + n,) of the poses and of n parameters of cameras.
     """
     n_poses = POSE * len(poses)
-    moved, b, by = np.empty_like(landmarks), np.zeros(3), np.zeros(3)
+    moved, b, by, work = np.empty_like(landmarks), np.zeros(3), np.zeros(3), np.zeros((3, 3))
     for point in range(len(landmarks)):
         for r in range(3):
             b[r] = eliminated.gradient[point, r]
@@ -113,46 +112,72 @@ def landmarks_after(
             for c in range(3):
                 by[r] -= eliminated.inverse[point, r, c] * b[c]
         first = structure.rows[point]
-        state, frame = structure.state[first], structure.odom_T_landmark[point]
-        body_T_cam = cameras.body_T_cam[structure.camera[first]]
-        cam_T_frame = se3_compose(se3_inverse(se3_compose(poses[state], body_T_cam)), frame)
-        frame_T_moved = se3_compose(se3_inverse(frame), se3_compose(moved_poses[state], body_T_cam))
-        body_step = step[POSE * state : POSE * state + POSE]
-        _move_with_camera(landmarks[point], by, cam_T_frame, frame_T_moved, body_T_cam, body_step, moved[point])
+        k = structure.state[first]
+        _move_with_camera(
+            structure.odom_T_landmark[point], landmarks[point], by, poses[k], moved_poses[k],
+            cameras.body_T_cam[structure.camera[first]], step[POSE * k : POSE * k + POSE], work, moved[point],
+        )  # fmt: skip
     return moved
 
 
 @kernel
 def _move_with_camera(
-    landmark: Float, by: Float, cam_T_frame: Float, frame_T_moved: Float, body_T_cam: Float, step: Float, moved: Float
-) -> None:
-    """Fill in the landmark (3,) after its own step (3,) and that of a body with a camera (6,)."""
-    w, rotation, place = landmark[2], cam_T_frame[:3, :3], cam_T_frame[:3, 3]
-    at, by_body, change = np.empty(3), np.empty(3), np.empty(3)
+    frame: Float, landmark: Float, by: Float, pose: Float, moved_pose: Float, body_T_cam: Float, step: Float,
+    work: Float, moved: Float,
+) -> None:  # fmt: skip
+    """Fill in the landmark (3,) after its own step (3,) and that of a body (6,) whose camera sees it.
+
+    Args:
+        frame: (4, 4) of the landmark in odom.
+        landmark: (3,) before.
+        by: (3,) its step in that frame, which stays.
+        pose: (4, 4) ``odom_T_body`` before.
+        moved_pose: (4, 4) after.
+        body_T_cam: (4, 4).
+        step: (6,) of the pose.
+        work: (3, 3) for intermediate results.
+        moved: (3,) output.
+    """
+    odom, body, cam, w = work[0], work[1], work[2], landmark[2]
+    # Where it is: homogeneous, in body and in the camera.
     for r in range(3):
-        at[r] = rotation[r, 0] * landmark[0] + rotation[r, 1] * landmark[1] + rotation[r, 2] + w * place[r]
-    from_body = rotate(body_T_cam[:3, :3], at)
+        odom[r] = frame[r, 0] * landmark[0] + frame[r, 1] * landmark[1] + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
     for r in range(3):
-        from_body[r] += w * body_T_cam[r, 3]
+        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2]
+    x, y, z = body[0], body[1], body[2]
     for r in range(3):
-        next_r, last_r = (r + 1) % 3, (r + 2) % 3
-        by_body[r] = step[next_r] * from_body[last_r] - step[last_r] * from_body[next_r] + w * step[3 + r]
-    by_body = rotate(body_T_cam[:3, :3].T, by_body)
+        cam[r] = 0.0
+        for c in range(3):
+            cam[r] += body_T_cam[c, r] * (body[c] - w * body_T_cam[c, 3])
+    at_x, at_y, depth, at_w = cam[0] / cam[2], cam[1] / cam[2], cam[2], w / cam[2]
+    # How that changes, in first order: by its own step, and as the body turns and shifts.
     for r in range(3):
-        change[r] = rotation[r, 0] * by[0] + rotation[r, 1] * by[1] + by[2] * place[r] - by_body[r]
-    x, y, inverse_depth = at[0] / at[2], at[1] / at[2], w / at[2]
-    x += (change[0] - x * change[2]) / at[2]
-    y += (change[1] - y * change[2]) / at[2]
-    nearer = (by[2] - inverse_depth * change[2]) / at[2]
-    if inverse_depth > 0.0 and nearer < _MAX_NEARER * inverse_depth:
-        inverse_depth /= 1.0 - nearer / inverse_depth  # a step of the depth
+        odom[r] = frame[r, 0] * by[0] + frame[r, 1] * by[1] + by[2] * (frame[r, 3] - pose[r, 3])
+    for r in range(3):
+        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2] - w * step[3 + r]
+    body[0] -= step[1] * z - step[2] * y
+    body[1] -= step[2] * x - step[0] * z
+    body[2] -= step[0] * y - step[1] * x
+    for r in range(3):
+        cam[r] = 0.0
+        for c in range(3):
+            cam[r] += body_T_cam[c, r] * (body[c] - by[2] * body_T_cam[c, 3])
+    nearer = (by[2] - at_w * cam[2]) / depth
+    at_x, at_y = at_x + (cam[0] - at_x * cam[2]) / depth, at_y + (cam[1] - at_y * cam[2]) / depth
+    if at_w > 0.0 and nearer < _MAX_NEARER * at_w:
+        at_w /= 1.0 - nearer / at_w  # a step of the depth
     else:
-        inverse_depth += nearer
+        at_w += nearer
+    # Back into its frame, from where the camera is now.
     for r in range(3):
-        change[r] = frame_T_moved[r, 0] * x + frame_T_moved[r, 1] * y + frame_T_moved[r, 2]
-        change[r] += inverse_depth * frame_T_moved[r, 3]
-    if at[2] > 0.0 and change[2] > 0.0:
-        moved[0], moved[1], moved[2] = change[0] / change[2], change[1] / change[2], inverse_depth / change[2]
+        body[r] = body_T_cam[r, 0] * at_x + body_T_cam[r, 1] * at_y + body_T_cam[r, 2] + at_w * body_T_cam[r, 3]
+    for r in range(3):
+        odom[r] = moved_pose[r, 0] * body[0] + moved_pose[r, 1] * body[1] + moved_pose[r, 2] * body[2]
+        odom[r] += at_w * (moved_pose[r, 3] - frame[r, 3])
+    for r in range(3):
+        cam[r] = frame[0, r] * odom[0] + frame[1, r] * odom[1] + frame[2, r] * odom[2]
+    if depth > 0.0 and cam[2] > 0.0:
+        moved[0], moved[1], moved[2] = cam[0] / cam[2], cam[1] / cam[2], at_w / cam[2]
     else:  # behind a camera
         for r in range(3):
             moved[r] = landmark[r] + by[r]
