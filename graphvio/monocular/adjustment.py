@@ -58,11 +58,13 @@ class Adjusted(NamedTuple):
     Attributes:
         states: adjusted.
         landmarks: (L, 3).
+        structure: their views, and the frames that they are in now.
         equations: at these.
     """
 
     states: States
     landmarks: Float
+    structure: Structure
     equations: Equations
 
 
@@ -149,21 +151,22 @@ def adjust(
             raise np.linalg.LinAlgError("the window's solution is not finite")
         moved = states.moved(step)
         of_views = step[visual_columns(n, states.n_cameras, len(step) - 9 * n - GRAVITY - BIASES)]
-        shifted = landmarks_after(
+        shifted, frames = landmarks_after(
             landmarks, measured.structure, states.cameras(measured.cameras), states.poses, moved.poses, at.eliminated,
             of_views,
         )  # fmt: skip
-        new = equations(measured, moved, shifted, prior, file)
+        following = measured._replace(structure=measured.structure._replace(odom_T_landmark=frames))
+        new = equations(following, moved, shifted, prior, file)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:
             gained = at.cost - new.cost
-            states, landmarks, at = moved, shifted, new
+            states, landmarks, at, measured = moved, shifted, new, following
             damping = max(0.1 * damping, 1e-9)
             if np.abs(step).max() < _CONVERGED or (file is not None and gained < _MIN_GAIN):
                 break
         else:
             damping = max(100.0 * damping, 1e-5)
-    return Adjusted(states, landmarks, at)
+    return Adjusted(states, landmarks, measured.structure, at)
 
 
 def evidence_of(at: Equations, states: States, file: Gaussian) -> Evidence:

@@ -168,6 +168,7 @@ class WindowCalibration:
     def _evidence_of(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> Evidence:
         """Return what a window that was adjusted with an exact file says of it."""
         file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
+        measured = measured._replace(structure=adjusted.structure)
         at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
         return evidence_of(at, adjusted.states, file)
 

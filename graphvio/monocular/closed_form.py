@@ -6,7 +6,7 @@ IJCV 106(2), 2014. The gyro's bias is the one for which the equations fit best: 
 initialization and gyroscope bias calibration in visual inertial aided navigation*, RA-L 2(1), 2017.
 
 In metres the equations have an attractive wrong solution: with small distances and no motion all errors are small. A
-vehicle that accelerates evenly is found there, its acceleration taken for a tilt. The unit of length is therefore the
+vehicle that accelerates evenly was taken for one that stands and is tilted. The unit of length is therefore the
 motion itself, and the length of a metre is one of the unknowns.
 """
 
@@ -66,7 +66,7 @@ class _Chain(NamedTuple):
 class _Views(NamedTuple):
     """N views of L landmarks, sorted by landmark; a point that several cameras see is a landmark of each.
 
-    What cameras see of each other's points would give the scale, but by a rig file that is wrong any scale.
+    What cameras see of each other's points would give the scale, but a wrong rig file gives a wrong one.
     """
 
     state: Int  # (N,)
@@ -98,7 +98,7 @@ class _Equations(NamedTuple):
     by_distance: Float  # (N, 3)
     gain: Float  # (L, 7): the best distances are ``-gain @ motion``
     normal: Float  # (7, 7) of the motion, with the best distances
-    length: Float  # (7, 7): ``motion @ length @ motion`` is the squared length of the keyframes' positions
+    length: Float  # (7, 7): ``motion @ length @ motion`` is the mean square of the keyframes' positions
 
 
 def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras, gyro_bias: Float) -> FirstGuess:
@@ -117,11 +117,11 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
     views, bias = _Views.of(structure, cameras), gyro_bias.copy()
     if len(views.firsts) < _MIN_LANDMARKS:
         raise np.linalg.LinAlgError("the images show too little motion")
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS):
         views = _reweighted(views, _equations(_chain(samples, bias), views))
         step = _bias_step(samples, views, bias, gyro_bias)
         bias = bias + step * min(1.0, _MAX_BIAS_STEP / max(float(np.linalg.norm(step)), 1e-12))
-        if np.linalg.norm(step) < _CONVERGED:
+        if k > 0 and np.linalg.norm(step) < _CONVERGED:
             break
     chain = _chain(samples, bias)
     velocity, gravity = _metric_motion(chain, views)
@@ -135,23 +135,30 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
 def _reweighted(views: _Views, at: _Equations) -> _Views:
     """Weight views such that errors are angles, and those of mismatches count little."""
     motion = _shortest(at.normal, at.length)
-    distances = np.maximum(np.abs(at.gain @ motion), _MIN_DISTANCE)[views.landmark]
+    distances = _distances(at, motion)[views.landmark]
     angles = np.linalg.norm(_errors(at, views, motion), axis=1) / views.weights / distances
     scale = _ROBUST_SCALE * max(float(np.median(angles)), 1e-5)
     return views._replace(weights=1.0 / (distances * (1.0 + (angles / scale) ** 2) ** 0.5))
 
 
 def _bias_step(samples: InertialSamples, views: _Views, bias: Float, known_bias: Float) -> Float:
-    """Return the step (3,) rad/s of Gauss and Newton from a gyro bias to the one for which the equations fit best."""
+    """Return the step (3,) rad/s of Gauss and Newton from a gyro bias to the one for which the equations fit best.
 
-    def errors(bias: Float) -> Float:
+    Errors are compared at the same distances: a bias by which all points are nearer would make all errors smaller.
+    """
+
+    def fit(bias: Float) -> tuple[Float, Float]:
         at = _equations(_chain(samples, bias), views)
-        return _errors(at, views, _shortest(at.normal, at.length)).ravel()
+        motion = _shortest(at.normal, at.length)
+        return _errors(at, views, motion).ravel(), np.log(_distances(at, motion))
 
-    at = errors(bias)
-    jacobian = np.column_stack([(errors(bias + _BIAS_STEP * axis) - at) / _BIAS_STEP for axis in np.eye(3)])
+    errors, log_distances = fit(bias)
+    jacobian = np.zeros((len(errors), 3))
+    for axis in range(3):
+        changed, now = fit(bias + _BIAS_STEP * np.eye(3)[axis])
+        jacobian[:, axis] = (changed * np.exp(np.median(log_distances - now)) - errors) / _BIAS_STEP
     held = (_ANGLE_SIGMA / _BIAS_SIGMA) ** 2
-    normal = product(jacobian.T.copy(), np.column_stack([jacobian, at]))
+    normal = product(jacobian.T.copy(), np.column_stack([jacobian, errors]))
     step = solve_symmetric(normal[:, :3] + held * np.eye(3), normal[:, 3] + held * (bias - known_bias))
     if not np.isfinite(step).all():
         raise np.linalg.LinAlgError("the images show too little motion")
@@ -159,29 +166,22 @@ def _bias_step(samples: InertialSamples, views: _Views, bias: Float, known_bias:
 
 
 def _metric_motion(chain: _Chain, views: _Views) -> tuple[Float, Float]:
-    """Return velocity (3,) m/s and gravity (3,) m/s^2 of its known length, in body at the first keyframe.
-
-    The direction of gravity is sought from that of the equations without its length, and from that of the mean specific
-    force: the former is undetermined where the body accelerates evenly and does not turn.
-    """
+    """Return velocity (3,) m/s and gravity (3,) m/s^2 of its known length, in body at the first keyframe."""
     at = _equations(chain, views)
 
     def motion(gravity: Float, across: Float) -> Float:
         """Return the best motion whose gravity is a given one, in metres, and any sum of others across it (3, A)."""
         basis = np.zeros((7, 4 + across.shape[1]))
         basis[:3, :3], basis[3:6, 3:-1], basis[3:6, -1], basis[6, -1] = np.eye(3), across, gravity, 1.0
-        return basis @ _shortest(basis.T @ at.normal @ basis, basis.T @ at.length @ basis)
+        normal, length = (product(product(basis.T.copy(), each), basis) for each in (at.normal, at.length))
+        return np.asarray(np.einsum("jm,m->j", basis, _shortest(normal, length)))
 
-    found = []
-    for gravity in (_shortest(at.normal, at.length)[3:6], -chain.velocities[-1]):
-        for _ in range(_LENGTH_ROUNDS):
-            norm = float(np.linalg.norm(gravity))
-            if norm == 0.0:
-                raise np.linalg.LinAlgError("the accelerometer shows no gravity")
-            gravity = gravity * (GRAVITY_M_S2 / norm)
-            found.append(motion(gravity, np.zeros((3, 0))))
-            gravity = motion(gravity, np.linalg.svd(gravity[None])[2][1:].T)[3:6]
-    best = min(found, key=lambda each: float(each @ at.normal @ each))
+    gravity, found = _shortest(at.normal, at.length)[3:6], []
+    for _ in range(_LENGTH_ROUNDS):
+        gravity = gravity * (GRAVITY_M_S2 / np.linalg.norm(gravity))
+        found.append(motion(gravity, np.zeros((3, 0))))
+        gravity = motion(gravity, np.linalg.svd(gravity[None])[2][1:].T)[3:6]
+    best = min(found, key=lambda each: float(np.einsum("j,jk,k->", each, at.normal, each)))
     if best[6] == 0.0:
         raise np.linalg.LinAlgError("the images show too little motion")
     return best[:3] / best[6], best[3:6] / best[6]
@@ -227,23 +227,31 @@ def _equations(chain: _Chain, views: _Views) -> _Equations:
     normal = np.einsum("nij,nik->jk", by_motion, by_motion) - product((gain / own).T.copy(), gain)
     times = chain.times[:, None, None] * np.eye(3)
     positions = np.concatenate([times, 0.5 * chain.times[:, None, None] * times, chain.positions[:, :, None]], axis=2)
-    return _Equations(by_motion, by_distance, gain / own, normal, np.einsum("kij,kim->jm", positions, positions))
+    length = np.einsum("kij,kim->jm", positions, positions) / len(positions)
+    return _Equations(by_motion, by_distance, gain / own, normal, length)
+
+
+def _distances(at: _Equations, motion: Float) -> Float:
+    """Return the distances (L,) of the landmarks that fit a motion (7,), not less than a bound."""
+    return np.asarray(np.maximum(np.abs(np.einsum("lj,j->l", at.gain, motion)), _MIN_DISTANCE))
 
 
 def _errors(at: _Equations, views: _Views, motion: Float) -> Float:
     """Return the weighted errors (N, 3) of a motion (7,)."""
-    distances = -(at.gain @ motion)[views.landmark]
+    distances = -np.einsum("lj,j->l", at.gain, motion)[views.landmark]
     return np.asarray(np.einsum("nij,j->ni", at.by_motion, motion) + at.by_distance * distances[:, None])
 
 
 def _shortest(matrix: Float, norm: Float) -> Float:
-    """Return the vector x (M,) with the smallest ``x matrix x`` of those with ``x norm x = 1``; its last is positive.
+    """Return the vector x (M,), its last not negative, with the smallest ``x matrix x`` where ``x norm x = 1``.
 
     Raises:
         numpy.linalg.LinAlgError: if there is none.
     """
     lower = cholesky(matrix + 1e-12 * np.trace(matrix) * np.eye(len(matrix)))
     whitened = solve_lower(lower, solve_lower(lower, norm).T.copy())
+    if not np.isfinite(whitened).all():
+        raise np.linalg.LinAlgError("the images show too little motion")
     values, vectors = eigen(0.5 * (whitened + whitened.T))
     largest = int(np.argmax(values))
     if not values[largest] > 0.0:

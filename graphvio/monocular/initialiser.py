@@ -171,9 +171,10 @@ class Initialiser:
                     measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file
                 )
                 states, places = rough.states, rough.landmarks
+                measured = measured._replace(structure=rough.structure)
             adjusted = adjust(measured, states, places, prior, _STEPS, file)
             states = adjusted.states
-            landmarks.put(adjusted.landmarks)
+            landmarks.put(adjusted.structure.odom_T_landmark, adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, MAX_OFF)
             if file is not None and is_first:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
@@ -248,9 +249,9 @@ def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior, file: G
     for factor in _OTHER_SCALES:
         scaled = states.poses.copy()
         scaled[:, :3, 3] *= factor
-        frames = measured.structure.odom_T_landmark.copy()
+        frames = adjusted.structure.odom_T_landmark.copy()
         frames[:, :3, 3] *= factor
-        other = measured._replace(structure=measured.structure._replace(odom_T_landmark=frames))
+        other = measured._replace(structure=adjusted.structure._replace(odom_T_landmark=frames))
         start = replace(states, poses=scaled, velocities=factor * states.velocities)
         found = adjust(other, start, adjusted.landmarks * np.array([1.0, 1.0, 1.0 / factor]), prior, _STEPS, file)
         apart = abs(_size(found.states) / _size(states) - 1.0)

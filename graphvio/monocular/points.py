@@ -12,7 +12,6 @@ from graphvio.measurements.motion import LocatedPoints
 from graphvio.monocular.adjustment import Adjusted, covariance_of
 from graphvio.monocular.sightings import Views
 from graphvio.monocular.states import BIASES, GRAVITY
-from graphvio.monocular.structure import Structure
 
 _MIN_DEPTH_SIGMAS = 3.0  # a more uncertain inverse depth has no covariance in metres
 
@@ -22,13 +21,11 @@ class Solved(NamedTuple):
 
     Attributes:
         adjusted: states and landmarks.
-        structure: of these.
         ids: (L,) identities of the landmarks.
         newest: what is seen from the newest state.
     """
 
     adjusted: Adjusted
-    structure: Structure
     ids: Int
     newest: Views
 
@@ -74,7 +71,7 @@ def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
     With poses and cameras x, a landmark is ``l - V^-1 (b + W^T x)``: its covariance is that for given ones, ``V^-1``,
     and what theirs adds.
     """
-    (states, landmarks, at), structure = solved.adjusted, solved.structure
+    states, landmarks, structure, at = solved.adjusted
     n_poses, n_cameras = 6 * len(states.poses), at.eliminated.by_cameras.shape[2]
     of_cameras = 9 * len(states.poses) + GRAVITY + BIASES + np.arange(n_cameras)
     joint, n_unknowns = covariance_of(at.hessian, np.r_[:n_poses, of_cameras]), n_poses + n_cameras

@@ -20,7 +20,7 @@ OF_STATE = 24
 POINT_AT = OF_STATE
 COLUMNS = POINT_AT + 3
 
-_MIN_DEPTH_RATIO = 1e-3
+MIN_DEPTH_RATIO = 1e-3
 
 
 class Cameras(NamedTuple):
@@ -136,7 +136,7 @@ def whiten_view(
     cam_x = body_T_cam[0, 0] * left_x + body_T_cam[1, 0] * left_y + body_T_cam[2, 0] * left_z
     cam_y = body_T_cam[0, 1] * left_x + body_T_cam[1, 1] * left_y + body_T_cam[2, 1] * left_z
     cam_z = body_T_cam[0, 2] * left_x + body_T_cam[1, 2] * left_y + body_T_cam[2, 2] * left_z
-    if not cam_z > _MIN_DEPTH_RATIO:
+    if not cam_z > MIN_DEPTH_RATIO:
         return False
     u, v, by_depth = cam_x / cam_z, cam_y / cam_z, scale / cam_z
     if len(by_lens):

@@ -203,9 +203,9 @@ class Landmarks:
         structure = Structure(frames, bounds, state[rows], camera[rows], np.ascontiguousarray(rays[rows]))
         return structure, places, ids
 
-    def put(self, places: Float) -> None:
-        """Take new places (L, 3) of the landmarks that were last collected."""
-        self._places = places
+    def put(self, frames: Float, places: Float) -> None:
+        """Take new frames (L, 4, 4) of the landmarks that were last collected, and their places (L, 3) there."""
+        self._frames, self._places = frames, places
 
     def turn(self, new_T_odom: Float) -> None:
         """Express the landmarks in another frame."""

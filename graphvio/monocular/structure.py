@@ -1,8 +1,8 @@
 """Landmarks that single cameras see from the states of a window, and where they are.
 
-A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a fixed frame, that of the camera which saw it
-first as it was estimated then: `w` is its inverse depth there. Before there is a baseline a wide prior stands for `w`.
-Where views overlap, several cameras see a landmark from one state, and know its distance in metres.
+A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own, that of the camera which sees
+it first as it was last estimated: `w` is its inverse depth there. Before there is a baseline a wide prior stands for
+`w`. Where views overlap, several cameras see a landmark from one state, and know its distance in metres.
 """
 
 from typing import NamedTuple
@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.geometry import se3_compose
 from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import (
     COLUMNS,
     ERROR_AT,
+    MIN_DEPTH_RATIO,
     POINT_AT,
     POSE,
     Cameras,
@@ -81,12 +83,13 @@ class Eliminated(NamedTuple):
 def landmarks_after(
     landmarks: Float, structure: Structure, cameras: Cameras, poses: Float, moved_poses: Float, eliminated: Eliminated,
     step: Float,
-) -> Float:  # fmt: skip
-    """Return the landmarks (L, 3) after a step of the poses and cameras.
+) -> tuple[Float, Float]:  # fmt: skip
+    """Return the landmarks (L, 3) after a step of the poses and cameras, and their frames (L, 4, 4).
 
-    A landmark moves along with the camera that sees it first, and the step changes its direction and distance there. So
-    all distances and baselines may become larger by the same factor, and no view changes: for a landmark that stays in
-    its fixed frame, views are off by the square of the step, and the scale is found in steps of a few percent.
+    A landmark moves along with the camera that sees it first, which becomes its frame, and the step changes its
+    direction and distance there. So all distances and baselines may become larger by the same factor, and no view
+    changes: for a landmark that stays in a fixed frame, views are off by the square of the step, and the scale is found
+    in steps of a few percent.
 
     Args:
         landmarks: (L, 3) before.
@@ -98,7 +101,8 @@ def landmarks_after(
         step: (6 K + n,) of the poses and of n parameters of cameras.
     """
     n_poses = POSE * len(poses)
-    moved, b, by, work = np.empty_like(landmarks), np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    moved, frames, b, by = np.empty_like(landmarks), structure.odom_T_landmark.copy(), np.zeros(3), np.zeros(3)
+    work = np.zeros((3, 3))
     for point in range(len(landmarks)):
         for r in range(3):
             b[r] = eliminated.gradient[point, r]
@@ -112,31 +116,36 @@ def landmarks_after(
             for c in range(3):
                 by[r] -= eliminated.inverse[point, r, c] * b[c]
         first = structure.rows[point]
-        k = structure.state[first]
-        _move_with_camera(
-            structure.odom_T_landmark[point], landmarks[point], by, poses[k], moved_poses[k],
-            cameras.body_T_cam[structure.camera[first]], step[POSE * k : POSE * k + POSE], work, moved[point],
-        )  # fmt: skip
-    return moved
+        k, body_T_cam = structure.state[first], cameras.body_T_cam[structure.camera[first]]
+        if _moved_with_camera(
+            frames[point], landmarks[point], by, poses[k], body_T_cam, step[POSE * k : POSE * k + POSE], work,
+            moved[point],
+        ):  # fmt: skip
+            frames[point] = se3_compose(moved_poses[k], body_T_cam)
+        else:
+            for r in range(3):
+                moved[point, r] = landmarks[point, r] + by[r]
+    return moved, frames
 
 
 @kernel
-def _move_with_camera(
-    frame: Float, landmark: Float, by: Float, pose: Float, moved_pose: Float, body_T_cam: Float, step: Float,
-    work: Float, moved: Float,
-) -> None:  # fmt: skip
-    """Fill in the landmark (3,) after its own step (3,) and that of a body (6,) whose camera sees it.
+def _moved_with_camera(
+    frame: Float, landmark: Float, by: Float, pose: Float, body_T_cam: Float, step: Float, work: Float, moved: Float
+) -> bool:
+    """Fill in the landmark (3,), in the frame of the camera, after its own step (3,) and that of the body (6,).
 
     Args:
         frame: (4, 4) of the landmark in odom.
         landmark: (3,) before.
         by: (3,) its step in that frame, which stays.
         pose: (4, 4) ``odom_T_body`` before.
-        moved_pose: (4, 4) after.
         body_T_cam: (4, 4).
         step: (6,) of the pose.
         work: (3, 3) for intermediate results.
         moved: (3,) output.
+
+    Returns:
+        Whether the landmark is in front of the camera.
     """
     odom, body, cam, w = work[0], work[1], work[2], landmark[2]
     # Where it is: homogeneous, in body and in the camera.
@@ -149,6 +158,8 @@ def _move_with_camera(
         cam[r] = 0.0
         for c in range(3):
             cam[r] += body_T_cam[c, r] * (body[c] - w * body_T_cam[c, 3])
+    if not cam[2] > MIN_DEPTH_RATIO:
+        return False
     at_x, at_y, depth, at_w = cam[0] / cam[2], cam[1] / cam[2], cam[2], w / cam[2]
     # How that changes, in first order: by its own step, and as the body turns and shifts.
     for r in range(3):
@@ -162,25 +173,14 @@ def _move_with_camera(
         cam[r] = 0.0
         for c in range(3):
             cam[r] += body_T_cam[c, r] * (body[c] - by[2] * body_T_cam[c, 3])
+    moved[0] = at_x + (cam[0] - at_x * cam[2]) / depth
+    moved[1] = at_y + (cam[1] - at_y * cam[2]) / depth
     nearer = (by[2] - at_w * cam[2]) / depth
-    at_x, at_y = at_x + (cam[0] - at_x * cam[2]) / depth, at_y + (cam[1] - at_y * cam[2]) / depth
     if at_w > 0.0 and nearer < _MAX_NEARER * at_w:
-        at_w /= 1.0 - nearer / at_w  # a step of the depth
+        moved[2] = at_w / (1.0 - nearer / at_w)  # a step of the depth
     else:
-        at_w += nearer
-    # Back into its frame, from where the camera is now.
-    for r in range(3):
-        body[r] = body_T_cam[r, 0] * at_x + body_T_cam[r, 1] * at_y + body_T_cam[r, 2] + at_w * body_T_cam[r, 3]
-    for r in range(3):
-        odom[r] = moved_pose[r, 0] * body[0] + moved_pose[r, 1] * body[1] + moved_pose[r, 2] * body[2]
-        odom[r] += at_w * (moved_pose[r, 3] - frame[r, 3])
-    for r in range(3):
-        cam[r] = frame[0, r] * odom[0] + frame[1, r] * odom[1] + frame[2, r] * odom[2]
-    if depth > 0.0 and cam[2] > 0.0:
-        moved[0], moved[1], moved[2] = cam[0] / cam[2], cam[1] / cam[2], at_w / cam[2]
-    else:  # behind a camera
-        for r in range(3):
-            moved[r] = landmark[r] + by[r]
+        moved[2] = at_w + nearer
+    return True
 
 
 @kernel

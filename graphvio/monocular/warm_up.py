@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.backend.states import level_gravity
-from graphvio.linear_algebra import solve_rows
+from graphvio.linear_algebra import eigen, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import Measurements, adjust, covariance_of
 from graphvio.monocular.initialiser import POSE_SIGMAS
@@ -37,6 +37,7 @@ def adjust_no_keyframes(rig: Rig) -> None:
     places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
     adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)
     covariance_of(np.eye(6), np.arange(6))
+    eigen(np.eye(7))
     preintegrate(*samples[:2], 0, second // 10, np.zeros(PARAMETERS), samples.noise_densities, samples.max_gap_ns)
     file_prior(rig)
     for part in (np.eye(6), np.eye(9)[:6, :6]):  # whole, and a part of a larger matrix

@@ -121,13 +121,14 @@ class WindowSolver:
         adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
         if is_keyframe and calibration.doubts_file(measured, adjusted, window.prior):
             adjusted = adjust(
-                measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS, calibration.file()
-            )
+                measured._replace(structure=adjusted.structure), adjusted.states, adjusted.landmarks, window.prior,
+                _RECALIBRATION_STEPS, calibration.file(),
+            )  # fmt: skip
         window.states = adjusted.states
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
-        window.landmarks.put(adjusted.landmarks)
+        window.landmarks.put(adjusted.structure.odom_T_landmark, adjusted.landmarks)
         is_tracking, dropped = self._leave_out_moving(window, structure, ids, adjusted.equations.errors2)
-        self._solved = Solved(adjusted, structure, ids, window.views[-1])
+        self._solved = Solved(adjusted, ids, window.views[-1])
         self.covariance = _newest_covariance(adjusted)
         if is_keyframe:
             calibration.note(stamp_ns, adjusted.states, self.covariance)
