@@ -146,7 +146,8 @@ def test_slam_killed_leaves_the_odometry_running(room_walk: Path, tmp_path: Path
     assert "the SLAM failed (exit code -9)" in line
     assert "the odometry goes on" in line
     assert {path.name for path in out.iterdir()} == {"odometry.txt", "online.txt"}
-    assert len(load_trajectory(out / "odometry.txt")) > 0.8 * open_source(room_walk, to_s=to_s).frameset_count
+    stamps_ns = load_trajectory(out / "odometry.txt").stamps_ns
+    assert stamps_ns[-1] - stamps_ns[0] > 0.8e9 * to_s  # on a busy machine framesets in between are skipped
     assert not list(temporary.iterdir())
     with socket.socket() as probe:  # the page has gone with it
         assert probe.connect_ex(("127.0.0.1", web.port)) != 0
