@@ -473,8 +473,7 @@ def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool,
     calibration = WindowCalibration(overlapping_rig() if shares else single_rig())
     file = calibration.file(np.ones(2)) if calibrates else None
     adjusted = adjust(measured, states, landmarks, prior, 12, file)
-    states, landmarks = adjusted.states, adjusted.landmarks
-    measured = measured._replace(structure=adjusted.structure)
+    states, landmarks, measured, _ = adjusted
     n = len(states.poses)
     sees = np.zeros(len(landmarks), dtype=bool)
     firsts = measured.structure.rows[:-1]
@@ -586,7 +585,7 @@ def car() -> Flight:
     )
 
 
-@pytest.mark.parametrize("factor", [0.5, 3.0])
+@pytest.mark.parametrize("factor", [0.3, 3.0])
 @pytest.mark.parametrize("flight", [moving(), car()], ids=["moving", "car"])
 def test_adjustment_from_a_wrong_scale_finds_the_true_one(flight: Flight, factor: float) -> None:
     measured, states, landmarks, prior = problem(12, is_exact=True, flight=flight)

@@ -58,13 +58,13 @@ class Adjusted(NamedTuple):
     Attributes:
         states: adjusted.
         landmarks: (L, 3).
-        structure: their views, and the frames that they are in now.
+        measured: what was adjusted, with the frames that the landmarks are in now.
         equations: at these.
     """
 
     states: States
     landmarks: Float
-    structure: Structure
+    measured: Measurements
     equations: Equations
 
 
@@ -166,7 +166,7 @@ def adjust(
                 break
         else:
             damping = max(100.0 * damping, 1e-5)
-    return Adjusted(states, landmarks, measured.structure, at)
+    return Adjusted(states, landmarks, measured, at)
 
 
 def evidence_of(at: Equations, states: States, file: Gaussian) -> Evidence:

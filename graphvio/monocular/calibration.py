@@ -12,7 +12,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.states import StateCovariance
 from graphvio.linear_algebra import cholesky, solve_rows
-from graphvio.monocular.adjustment import Adjusted, Measurements, equations, evidence_of
+from graphvio.monocular.adjustment import Adjusted, equations, evidence_of
 from graphvio.monocular.states import Prior, States
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
@@ -139,37 +139,35 @@ class WindowCalibration:
         self._kept = Evidence.none(len(self._rows))
         self._files.clear()
 
-    def is_contradicted(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
+    def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Return whether a first window, adjusted with an exact file, says that places or the IMU are far off in it.
 
         Arguments as `doubts_file`.
         """
         if not self.size:
             return False
-        likelihood = FactorLikelihood(self._kept.plus(self._evidence_of(measured, adjusted, prior)), self._prior)
+        likelihood = FactorLikelihood(self._kept.plus(self._evidence_of(adjusted, prior)), self._prior)
         as_stated, far_off = (likelihood(np.array([_MIN_FACTOR, factor])) for factor in (EXACT, _FAR_OFF))
         return bool(far_off - as_stated > _MIN_LOG_BAYES_FACTORS[1])
 
-    def doubts_file(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> bool:
+    def doubts_file(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Let the window say how wrong the rig file is, and return whether that is news.
 
         Args:
-            measured: in the window.
-            adjusted: states and landmarks of the window.
+            adjusted: window.
             prior: from before the window.
         """
         if not self.size:
             return False
         file = self.file()
         if file is None:
-            return self.update(self._evidence_of(measured, adjusted, prior))
+            return self.update(self._evidence_of(adjusted, prior))
         return self.update(evidence_of(adjusted.equations, adjusted.states, file))
 
-    def _evidence_of(self, measured: Measurements, adjusted: Adjusted, prior: Prior | None) -> Evidence:
+    def _evidence_of(self, adjusted: Adjusted, prior: Prior | None) -> Evidence:
         """Return what a window that was adjusted with an exact file says of it."""
         file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
-        measured = measured._replace(structure=adjusted.structure)
-        at = equations(measured, adjusted.states, adjusted.landmarks, prior, file)
+        at = equations(adjusted.measured, adjusted.states, adjusted.landmarks, prior, file)
         return evidence_of(at, adjusted.states, file)
 
     def update(self, evidence: Evidence) -> bool:

@@ -171,10 +171,10 @@ class Initialiser:
                     measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file
                 )
                 states, places = rough.states, rough.landmarks
-                measured = measured._replace(structure=rough.structure)
+                measured = measured._replace(structure=rough.measured.structure)
             adjusted = adjust(measured, states, places, prior, _STEPS, file)
             states = adjusted.states
-            landmarks.put(adjusted.structure.odom_T_landmark, adjusted.landmarks)
+            landmarks.put(adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, MAX_OFF)
             if file is not None and is_first:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
@@ -182,10 +182,10 @@ class Initialiser:
             fitting *= 1.0 - float(off.mean())
             names.end(ids[off])
             views = [each.without(ids[off]) for each in views]
-        self.reason = self._fault(adjusted, fitting, factors) or _ambiguity(measured, adjusted, prior, file)
+        self.reason = self._fault(adjusted, fitting, factors) or _ambiguity(adjusted, prior, file)
         if self.reason:
             return None
-        if file is None and self._doubts_file and self._calibration.is_contradicted(measured, adjusted, prior):
+        if file is None and self._doubts_file and self._calibration.is_contradicted(adjusted, prior):
             self._fits_no_motion = self._is_file_doubted = True
             self.reason = "images and IMU contradict the rig file"
             return None
@@ -240,18 +240,18 @@ def shared_points(sightings: Mapping[int, Sighting]) -> int:
     return sum(len(seen.rows) for sighting in sightings.values() for seen in sighting.elsewhere)
 
 
-def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior, file: Gaussian | None) -> str:
+def _ambiguity(adjusted: Adjusted, prior: Prior, file: Gaussian | None) -> str:
     """Say whether another scale fits as well as the one that was found, or nothing.
 
     A covariance is of one minimum, and says nothing of others: the window is adjusted again from other scales.
     """
-    states, cost = adjusted.states, adjusted.equations.cost
+    states, cost, structure = adjusted.states, adjusted.equations.cost, adjusted.measured.structure
     for factor in _OTHER_SCALES:
         scaled = states.poses.copy()
         scaled[:, :3, 3] *= factor
-        frames = adjusted.structure.odom_T_landmark.copy()
+        frames = structure.odom_T_landmark.copy()
         frames[:, :3, 3] *= factor
-        other = measured._replace(structure=adjusted.structure._replace(odom_T_landmark=frames))
+        other = adjusted.measured._replace(structure=structure._replace(odom_T_landmark=frames))
         start = replace(states, poses=scaled, velocities=factor * states.velocities)
         found = adjust(other, start, adjusted.landmarks * np.array([1.0, 1.0, 1.0 / factor]), prior, _STEPS, file)
         apart = abs(_size(found.states) / _size(states) - 1.0)

@@ -71,7 +71,8 @@ def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
     With poses and cameras x, a landmark is ``l - V^-1 (b + W^T x)``: its covariance is that for given ones, ``V^-1``,
     and what theirs adds.
     """
-    states, landmarks, structure, at = solved.adjusted
+    states, landmarks, measured, at = solved.adjusted
+    structure = measured.structure
     n_poses, n_cameras = 6 * len(states.poses), at.eliminated.by_cameras.shape[2]
     of_cameras = 9 * len(states.poses) + GRAVITY + BIASES + np.arange(n_cameras)
     joint, n_unknowns = covariance_of(at.hessian, np.r_[:n_poses, of_cameras]), n_poses + n_cameras

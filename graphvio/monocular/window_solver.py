@@ -119,14 +119,12 @@ class WindowSolver:
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
         adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
-        if is_keyframe and calibration.doubts_file(measured, adjusted, window.prior):
-            adjusted = adjust(
-                measured._replace(structure=adjusted.structure), adjusted.states, adjusted.landmarks, window.prior,
-                _RECALIBRATION_STEPS, calibration.file(),
-            )  # fmt: skip
+        if is_keyframe and calibration.doubts_file(adjusted, window.prior):
+            measured, places = adjusted.measured, adjusted.landmarks
+            adjusted = adjust(measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file())
         window.states = adjusted.states
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
-        window.landmarks.put(adjusted.structure.odom_T_landmark, adjusted.landmarks)
+        window.landmarks.put(adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
         is_tracking, dropped = self._leave_out_moving(window, structure, ids, adjusted.equations.errors2)
         self._solved = Solved(adjusted, ids, window.views[-1])
         self.covariance = _newest_covariance(adjusted)
