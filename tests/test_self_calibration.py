@@ -22,7 +22,7 @@ from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration import online
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
-from graphvio.self_calibration.collector import FullWindow
+from graphvio.self_calibration.collector import FullWindow, WindowCollector
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
@@ -44,6 +44,7 @@ from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks
 from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.simulation.default_rig import default_rig
+from graphvio.simulation.motion import Motion
 
 CAMERAS = ["focal", "principal-point", "distortion", "left-right-rotation", "baseline", "pair-transform"]
 
@@ -505,6 +506,42 @@ def test_solve_late_clock_does_not_drop_intervals_that_the_samples_cover() -> No
     prior = Evidence.none(len(parameter_names(rig))).given(file_prior(rig), np.full(2, 5.0))
     solution = solve(Window(tracks, 0.15, samples), states, nominal, prior.mean, prior)
     assert np.isfinite(solution.imu_errors2).all()
+
+
+class Flight(Walk):
+    """A flight at 12 m/s in a curve, with all points 60 to 200 m away: disparities are a pixel or less."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._motion = Motion(self._course, 6.0)
+        self._points = self._rng.uniform([80.0, -90.0, -60.0], [200.0, 90.0, 60.0], (2000, 3))
+
+    @staticmethod
+    def _course(t: Float) -> Float:
+        still = np.zeros_like(t)
+        return np.column_stack([12.0 * t, 6.0 * np.sin(0.8 * t), 2.0 * np.sin(t), still, still, still])
+
+
+def test_adjusted_window_of_far_points_does_not_keep_the_scale_of_the_first_poses() -> None:
+    # The odometry measured its motions with a left-right rotation that is off by a tenth of a pixel.
+    error = draw(default_rig(), CalibrationError.of_level(2, ["left-right-rotation"]), 0)
+    written, walk = error.written_rig, Flight(error.true_rig)
+    keyframes = [Keyframe(*frameset) for frameset in walk.framesets(6.0)][::5]
+    collector = WindowCollector(written)
+    for sample in walk.samples(6.0):
+        collector.add_sample(sample)
+    prior = Evidence.none(len(file_prior(written).group)).given(file_prior(written), np.ones(2))
+    true_m, found_m = np.linalg.norm(keyframes[-1].odom_T_body[:3, 3] - keyframes[0].odom_T_body[:3, 3]), []
+    for scale in (0.8, 1.2):
+        first = [np.array(keyframe.odom_T_body) for keyframe in keyframes]
+        for pose in first:
+            pose[:3, 3] *= scale
+        window = tuple(k._replace(odom_T_body=pose) for k, pose in zip(keyframes, first, strict=True))
+        samples = collector.samples_of(window)
+        solution = adjusted(window, samples, RigCalibration.of(written), prior.mean, prior, 0.15)
+        found_m.append(float(np.linalg.norm(solution.states.poses[-1, :3, 3] - solution.states.poses[0, :3, 3])))
+    assert found_m == pytest.approx([true_m] * 2, rel=0.02)
+    assert found_m[0] == pytest.approx(found_m[1], rel=1e-3)
 
 
 # ---------------------------------------------------------------- what users see

@@ -19,8 +19,9 @@ from graphvio.self_calibration.parameters import PAIR, RigCalibration
 _ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
 _MAX_STEPS = 6
 _CONVERGED = 0.05  # standard deviations of the prior
-_LOOSE_POSE_SIGMAS = np.repeat([np.deg2rad(5.0), 0.3], 3)  # keeps poses that no track constrains
+_LOOSE_ROTATION_SIGMA, _LOOSE_POSITION_SIGMA = np.deg2rad(5.0), 0.3  # keep poses that no track constrains
 _LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
+_LOOSE_SCALE_SIGMA = 5.0  # of distances and velocities: where all points are far, wrong cameras see a wrong scale
 _FIXED = 1e-9
 _FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
 _GRAVITY_NORM_SIGMA = 5e-3
@@ -161,7 +162,7 @@ def _linearise(
     hessian[calibration, calibration] += prior.information
     gradient[calibration] += prior.information @ (difference - prior.mean)
     cost += prior.cost(difference)
-    weights = np.tile(1.0 / _LOOSE_POSE_SIGMAS**2, n)
+    weights = 1.0 / _loose_pose_sigmas(first.poses) ** 2
     weights[:6] = 1.0 / _FIXED**2
     offsets = np.zeros((n, 6))
     offsets[:, 3:] = states.poses[:, :3, 3] - first.poses[:, :3, 3]
@@ -195,12 +196,21 @@ def _inertial_columns(n: int, c: int, n_cameras: int) -> Int:
     )
 
 
+def _loose_pose_sigmas(poses: Float) -> Float:
+    """Return the standard deviations (6 K,) of poses (K, 4, 4) that hardly hold them, nor how far they are apart."""
+    distances = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    positions = _LOOSE_POSITION_SIGMA + _LOOSE_SCALE_SIGMA * distances
+    return np.repeat(np.column_stack([np.full(len(poses), _LOOSE_ROTATION_SIGMA), positions]), 3)
+
+
 def _add_loose(states: States, first: States, hessian: Float, gradient: Float, at: int) -> float:
     """Add what is known of velocities and gravity beforehand: next to nothing but gravity's norm. Returns the cost."""
     velocities = np.arange(at, at + states.velocities.size)
     off = (states.velocities - first.velocities).ravel()
-    hessian[velocities, velocities] += 1.0 / _LOOSE_VELOCITY_SIGMA**2
-    gradient[velocities] += off / _LOOSE_VELOCITY_SIGMA**2
+    speeds = np.linalg.norm(first.velocities, axis=1)
+    weights = 1.0 / np.repeat(_LOOSE_VELOCITY_SIGMA + _LOOSE_SCALE_SIGMA * speeds, 3) ** 2
+    hessian[velocities, velocities] += weights
+    gradient[velocities] += weights * off
     gravity = np.arange(velocities[-1] + 1, velocities[-1] + 4)
     turned = states.gravity - first.gravity
     norm = float(np.linalg.norm(states.gravity))
@@ -209,7 +219,7 @@ def _add_loose(states: States, first: States, hessian: Float, gradient: Float, a
     hessian[np.ix_(gravity, gravity)] += np.outer(along, along) / _GRAVITY_NORM_SIGMA**2
     gradient[gravity] += turned / _LOOSE_GRAVITY_SIGMA**2 + along * excess / _GRAVITY_NORM_SIGMA**2
     return float(
-        0.5 * off @ off / _LOOSE_VELOCITY_SIGMA**2
+        0.5 * weights @ off**2
         + 0.5 * turned @ turned / _LOOSE_GRAVITY_SIGMA**2
         + 0.5 * (excess / _GRAVITY_NORM_SIGMA) ** 2
     )
