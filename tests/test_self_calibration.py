@@ -526,7 +526,7 @@ def test_adjusted_window_of_far_points_does_not_keep_the_scale_of_the_first_pose
     # The odometry measured its motions with a left-right rotation that is off by a tenth of a pixel.
     error = draw(default_rig(), CalibrationError.of_level(2, ["left-right-rotation"]), 0)
     written, walk = error.written_rig, Flight(error.true_rig)
-    keyframes = [Keyframe(*frameset) for frameset in walk.framesets(6.0)][::5]
+    keyframes = [Keyframe(*frameset) for frameset in walk.framesets(6.0)][5::5]
     collector = WindowCollector(written)
     for sample in walk.samples(6.0):
         collector.add_sample(sample)

@@ -15,7 +15,6 @@ from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import (
     COLUMNS,
     ERROR_AT,
-    MIN_DEPTH_RATIO,
     POINT_AT,
     POSE,
     Cameras,
@@ -23,13 +22,13 @@ from graphvio.monocular.reprojection import (
     whiten_view,
 )
 from graphvio.self_calibration.bundle import inverse3, rows_of
+from graphvio.self_calibration.moving_landmarks import moved_with_camera
 from graphvio.self_calibration.parameters import CAMERA
 
 PRIOR_INVERSE_DEPTH = 0.2
 PRIOR_INFORMATION = 1e-2  # of an inverse depth, known to 10 / m: more would pull the scale of all landmarks
 _STEPS = 6
 _LOCATED = 1e-9  # a smaller step ends the search of a landmark's place: it is less than a millionth of a pixel
-_MAX_NEARER = 0.5  # step of an inverse depth, relative, that is taken as one of the depth
 _FEW = 5  # views, of a landmark that is located again before the window is linearised
 
 
@@ -37,7 +36,7 @@ class Structure(NamedTuple):
     """Views of L landmarks from K states: N rows, sorted by landmark.
 
     Attributes:
-        odom_T_landmark: (L, 4, 4) fixed frame of each.
+        odom_T_landmark: (L, 4, 4) frame of each.
         rows: (L + 1,) the views of landmark l are ``rows[l]`` to ``rows[l + 1]``, in the order of states and cameras.
         state: (N,) index of the state.
         camera: (N,) index of the camera.
@@ -117,7 +116,7 @@ def landmarks_after(
                 by[r] -= eliminated.inverse[point, r, c] * b[c]
         first = structure.rows[point]
         k, body_T_cam = structure.state[first], cameras.body_T_cam[structure.camera[first]]
-        if _moved_with_camera(
+        if moved_with_camera(
             frames[point], landmarks[point], by, poses[k], body_T_cam, step[POSE * k : POSE * k + POSE], work,
             moved[point],
         ):  # fmt: skip
@@ -126,61 +125,6 @@ def landmarks_after(
             for r in range(3):
                 moved[point, r] = landmarks[point, r] + by[r]
     return moved, frames
-
-
-@kernel
-def _moved_with_camera(
-    frame: Float, landmark: Float, by: Float, pose: Float, body_T_cam: Float, step: Float, work: Float, moved: Float
-) -> bool:
-    """Fill in the landmark (3,), in the frame of the camera, after its own step (3,) and that of the body (6,).
-
-    Args:
-        frame: (4, 4) of the landmark in odom.
-        landmark: (3,) before.
-        by: (3,) its step in that frame, which stays.
-        pose: (4, 4) ``odom_T_body`` before.
-        body_T_cam: (4, 4).
-        step: (6,) of the pose.
-        work: (3, 3) for intermediate results.
-        moved: (3,) output.
-
-    Returns:
-        Whether the landmark is in front of the camera.
-    """
-    odom, body, cam, w = work[0], work[1], work[2], landmark[2]
-    # Where it is: homogeneous, in body and in the camera.
-    for r in range(3):
-        odom[r] = frame[r, 0] * landmark[0] + frame[r, 1] * landmark[1] + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
-    for r in range(3):
-        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2]
-    x, y, z = body[0], body[1], body[2]
-    for r in range(3):
-        cam[r] = 0.0
-        for c in range(3):
-            cam[r] += body_T_cam[c, r] * (body[c] - w * body_T_cam[c, 3])
-    if not cam[2] > MIN_DEPTH_RATIO:
-        return False
-    at_x, at_y, depth, at_w = cam[0] / cam[2], cam[1] / cam[2], cam[2], w / cam[2]
-    # How that changes, in first order: by its own step, and as the body turns and shifts.
-    for r in range(3):
-        odom[r] = frame[r, 0] * by[0] + frame[r, 1] * by[1] + by[2] * (frame[r, 3] - pose[r, 3])
-    for r in range(3):
-        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2] - w * step[3 + r]
-    body[0] -= step[1] * z - step[2] * y
-    body[1] -= step[2] * x - step[0] * z
-    body[2] -= step[0] * y - step[1] * x
-    for r in range(3):
-        cam[r] = 0.0
-        for c in range(3):
-            cam[r] += body_T_cam[c, r] * (body[c] - by[2] * body_T_cam[c, 3])
-    moved[0] = at_x + (cam[0] - at_x * cam[2]) / depth
-    moved[1] = at_y + (cam[1] - at_y * cam[2]) / depth
-    nearer = (by[2] - at_w * cam[2]) / depth
-    if at_w > 0.0 and nearer < _MAX_NEARER * at_w:
-        moved[2] = at_w / (1.0 - nearer / at_w)  # a step of the depth
-    else:
-        moved[2] = at_w + nearer
-    return True
 
 
 @kernel

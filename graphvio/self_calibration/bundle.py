@@ -1,7 +1,7 @@
 """Bundle adjustment of a window of keyframes, with the calibration of all cameras as shared unknowns.
 
-A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a fixed frame, that of the left camera which saw
-it first as it was estimated then: `w` is its inverse depth there. It is seen in keyframe k by a pair's left camera as
+A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own, that of the left camera which
+saw it first as it was last estimated: `w` is its inverse depth there. It is seen in keyframe k by a pair's left camera as
 ``left_T_body inverse(odom_T_body_k) odom_T_landmark [a, b, 1, w]``, and by the right one through ``right_T_left``.
 Landmarks are eliminated one after the other (Schur complement), so that poses and calibration remain:
 B. Triggs et al., *Bundle adjustment: a modern synthesis*, 2000, section 6.
@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.geometry import se3_compose
 from graphvio.kernels import kernel, vector_kernel
+from graphvio.self_calibration.moving_landmarks import moved_with_camera
 from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, POINT, POINT_AT, POSE, new_scratch, observe
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
@@ -24,7 +26,7 @@ class Tracks(NamedTuple):
 
     Attributes:
         pair: (L,) index of the pair or single camera that sees each landmark.
-        odom_T_landmark: (L, 4, 4) fixed frame of each.
+        odom_T_landmark: (L, 4, 4) frame of each.
         rows: (L + 1,) the observations of landmark l are ``rows[l]`` to ``rows[l + 1]``.
         keyframe: (N,) index.
         left_px: (N, 2).
@@ -288,20 +290,44 @@ def inverse3(m: Float, out: Float) -> None:
 
 
 @kernel
-def landmarks_after(landmarks: Float, tracks: Tracks, eliminated: Eliminated, step: Float, n_keyframes: int) -> Float:
-    """Return the landmarks (L, 3) after a step (6 K + P PAIR,) of poses and calibration."""
-    moved = landmarks.copy()
+def landmarks_after(
+    landmarks: Float, tracks: Tracks, calibration: RigCalibration, poses: Float, moved_poses: Float,
+    eliminated: Eliminated, step: Float,
+) -> tuple[Float, Float]:  # fmt: skip
+    """Return the landmarks (L, 3) after a step of poses and calibration, and their frames (L, 4, 4).
+
+    Args:
+        landmarks: (L, 3) before.
+        tracks: of these.
+        calibration: of P pairs, before.
+        poses: (K, 4, 4) ``odom_T_body``, before.
+        moved_poses: (K, 4, 4) after.
+        eliminated: what the elimination of the landmarks left behind.
+        step: (6 K + P PAIR,) of poses and calibration.
+    """
+    moved, frames = np.empty_like(landmarks), tracks.odom_T_landmark.copy()
+    b, by, work = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     for point in range(len(landmarks)):
-        at = 6 * n_keyframes + PAIR * tracks.pair[point]
-        b = eliminated.gradient[point].copy()
+        first, end, at = tracks.rows[point], tracks.rows[point + 1], POSE * len(poses) + PAIR * tracks.pair[point]
         for r in range(3):
+            b[r] = eliminated.gradient[point, r]
             for c in range(PAIR):
                 b[r] += eliminated.by_calibration[point, r, c] * step[at + c]
-            for n in range(tracks.rows[point], tracks.rows[point + 1]):
-                k = 6 * tracks.keyframe[n]
-                for c in range(6):
+            for n in range(first, end):
+                k = POSE * tracks.keyframe[n]
+                for c in range(POSE):
                     b[r] += eliminated.by_pose[n, r, c] * step[k + c]
         for r in range(3):
+            by[r] = 0.0
             for c in range(3):
-                moved[point, r] -= eliminated.inverse[point, r, c] * b[c]
-    return moved
+                by[r] -= eliminated.inverse[point, r, c] * b[c]
+        k, body_T_left = tracks.keyframe[first], calibration.body_T_left[tracks.pair[point]]
+        if moved_with_camera(
+            frames[point], landmarks[point], by, poses[k], body_T_left, step[POSE * k : POSE * k + POSE], work,
+            moved[point],
+        ):  # fmt: skip
+            frames[point] = se3_compose(moved_poses[k], body_T_left)
+        else:
+            for r in range(3):
+                moved[point, r] = landmarks[point, r] + by[r]
+    return moved, frames

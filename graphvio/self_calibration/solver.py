@@ -34,7 +34,7 @@ class States(NamedTuple):
         poses: (K, 4, 4) ``odom_T_body``; the first one stays.
         velocities: (K, 3) m/s, frame odom.
         gravity: (3,) m/s^2, frame odom.
-        landmarks: (L, 3).
+        landmarks: (L, 3), in frames that move along with poses, see `landmarks_after`.
     """
 
     poses: Float
@@ -115,15 +115,15 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
     for _ in range(_MAX_STEPS):
         damped = at.hessian + damping * np.diag(np.diag(at.hessian))
         step = -solve_symmetric(damped, at.gradient)
-        moved = _moved(states, window.tracks, found, step, nominal, len(difference))
+        following, moved = _moved(window, states, nominal, difference, found, step)
         changed = difference + step[calibration]
         kept = found
         found = Eliminated.empty(window.tracks)
         damping = max(0.1 * damping, _MIN_DAMPING)
-        new = _linearise(window, moved, first, nominal, changed, prior, damping, found)
+        new = _linearise(following, moved, first, nominal, changed, prior, damping, found)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:
-            states, difference, at, damping_at = moved, changed, new, damping
+            window, states, difference, at, damping_at = following, moved, changed, new, damping
             if np.abs(step[calibration] / sigmas).max() < _CONVERGED:
                 break
         else:
@@ -226,23 +226,26 @@ def _add_loose(states: States, first: States, hessian: Float, gradient: Float, a
 
 
 def _moved(
-    states: States, tracks: Tracks, eliminated: Eliminated, step: Float, nominal: RigCalibration, n_calibration: int
-) -> States:
-    """Return the states after a step; the landmarks follow from it."""
-    n = len(states.poses)
+    window: Window, states: States, nominal: RigCalibration, difference: Float, eliminated: Eliminated, step: Float
+) -> tuple[Window, States]:
+    """Return the states after a step, and the window with the frames of the landmarks then; these follow from it."""
+    n, n_cameras = len(states.poses), len(nominal.columns)
     poses = states.poses.copy()
     for k, of_pose in enumerate(step[: 6 * n].reshape(n, 6)):
         poses[k, :3, 3] += states.poses[k, :3, :3] @ of_pose[3:]
         poses[k, :3, :3] = states.poses[k, :3, :3] @ so3_exp(of_pose[:3].copy())
     of_cameras, columns = np.zeros(6 * n + PAIR * len(nominal.models)), _visual_columns(n, nominal)
     of_cameras[columns] = step[: len(columns)]
-    landmarks = landmarks_after(states.landmarks, tracks, eliminated, of_cameras, n)
-    inertial = step[6 * n + n_calibration :]
-    if not len(inertial):
-        return states._replace(poses=poses, landmarks=landmarks)
-    return States(
-        poses, states.velocities + inertial[: 3 * n].reshape(n, 3), states.gravity + inertial[3 * n :], landmarks
+    calibration = nominal.moved(difference[:n_cameras])
+    landmarks, frames = landmarks_after(
+        states.landmarks, window.tracks, calibration, states.poses, poses, eliminated, of_cameras
     )
+    following = window._replace(tracks=window.tracks._replace(odom_T_landmark=frames))
+    inertial = step[6 * n + len(difference) :]
+    if not len(inertial):
+        return following, states._replace(poses=poses, landmarks=landmarks)
+    velocities, gravity = states.velocities + inertial[: 3 * n].reshape(n, 3), states.gravity + inertial[3 * n :]
+    return following, States(poses, velocities, gravity, landmarks)
 
 
 def _marginal(hessian: Float, kept: slice) -> Float:

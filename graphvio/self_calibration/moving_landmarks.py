@@ -1,0 +1,68 @@
+"""Landmarks that move along with the camera that sees them first, while a window is adjusted.
+
+A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own. With the camera that sees it
+first as this frame, and steps of its direction and distance there, all distances and baselines may become larger by the
+same factor, and no view changes: for a landmark that stays in a fixed frame, views are off by the square of the step,
+and the scale is found in steps of a few percent.
+"""
+
+from graphvio.arrays import Float
+from graphvio.kernels import kernel
+
+_MIN_DEPTH_RATIO = 1e-3
+_MAX_NEARER = 0.5  # step of an inverse depth, relative, that is taken as one of the depth
+
+
+@kernel
+def moved_with_camera(
+    frame: Float, landmark: Float, by: Float, pose: Float, body_T_cam: Float, step: Float, work: Float, moved: Float
+) -> bool:
+    """Fill in the landmark (3,), in the frame of the camera, after its own step (3,) and that of the body (6,).
+
+    Args:
+        frame: (4, 4) of the landmark in odom.
+        landmark: (3,) before.
+        by: (3,) its step in that frame, which stays.
+        pose: (4, 4) ``odom_T_body`` before.
+        body_T_cam: (4, 4).
+        step: (6,) of the pose.
+        work: (3, 3) for intermediate results.
+        moved: (3,) output.
+
+    Returns:
+        Whether the landmark is in front of the camera.
+    """
+    odom, body, cam, w = work[0], work[1], work[2], landmark[2]
+    # Where it is: homogeneous, in body and in the camera.
+    for r in range(3):
+        odom[r] = frame[r, 0] * landmark[0] + frame[r, 1] * landmark[1] + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
+    for r in range(3):
+        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2]
+    x, y, z = body[0], body[1], body[2]
+    for r in range(3):
+        cam[r] = 0.0
+        for c in range(3):
+            cam[r] += body_T_cam[c, r] * (body[c] - w * body_T_cam[c, 3])
+    if not cam[2] > _MIN_DEPTH_RATIO:
+        return False
+    at_x, at_y, depth, at_w = cam[0] / cam[2], cam[1] / cam[2], cam[2], w / cam[2]
+    # How that changes, in first order: by its own step, and as the body turns and shifts.
+    for r in range(3):
+        odom[r] = frame[r, 0] * by[0] + frame[r, 1] * by[1] + by[2] * (frame[r, 3] - pose[r, 3])
+    for r in range(3):
+        body[r] = pose[0, r] * odom[0] + pose[1, r] * odom[1] + pose[2, r] * odom[2] - w * step[3 + r]
+    body[0] -= step[1] * z - step[2] * y
+    body[1] -= step[2] * x - step[0] * z
+    body[2] -= step[0] * y - step[1] * x
+    for r in range(3):
+        cam[r] = 0.0
+        for c in range(3):
+            cam[r] += body_T_cam[c, r] * (body[c] - by[2] * body_T_cam[c, 3])
+    moved[0] = at_x + (cam[0] - at_x * cam[2]) / depth
+    moved[1] = at_y + (cam[1] - at_y * cam[2]) / depth
+    nearer = (by[2] - at_w * cam[2]) / depth
+    if at_w > 0.0 and nearer < _MAX_NEARER * at_w:
+        moved[2] = at_w / (1.0 - nearer / at_w)  # a step of the depth
+    else:
+        moved[2] = at_w + nearer
+    return True
