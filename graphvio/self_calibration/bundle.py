@@ -1,7 +1,7 @@
 """Bundle adjustment of a window of keyframes, with the calibration of all cameras as shared unknowns.
 
 A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own, that of the left camera which
-saw it first as it was last estimated: `w` is its inverse depth there. It is seen in keyframe k by a pair's left camera as
+saw it first as it was last estimated: `w` is its inverse depth there. Keyframe k sees it by a pair's left camera as
 ``left_T_body inverse(odom_T_body_k) odom_T_landmark [a, b, 1, w]``, and by the right one through ``right_T_left``.
 Landmarks are eliminated one after the other (Schur complement), so that poses and calibration remain:
 B. Triggs et al., *Bundle adjustment: a modern synthesis*, 2000, section 6.
