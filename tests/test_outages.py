@@ -18,6 +18,7 @@ from graphvio.rig import Rig
 from graphvio.trajectory_files import load_trajectory
 
 START_S = 3.0  # of what goes wrong
+END_S = 7.0  # of most walks
 PERIOD_S = 0.05
 MS = 1_000_000
 
@@ -28,8 +29,15 @@ def walk_folder(long_room_walk: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def measurements(walk_folder: Path) -> list[Measurement]:
+def long_measurements(walk_folder: Path) -> list[Measurement]:
+    """Of ten seconds, for faults that last for several."""
     return list(open_source(walk_folder))
+
+
+@pytest.fixture(scope="module")
+def measurements(long_measurements: list[Measurement]) -> list[Measurement]:
+    """Of the first seven seconds: a fault of up to two seconds, and as long after it."""
+    return until(long_measurements, END_S)
 
 
 @dataclass
@@ -124,6 +132,12 @@ def altered(
     return made
 
 
+def until(measurements: list[Measurement], end_s: float) -> list[Measurement]:
+    """Those of the first seconds."""
+    end_ns = next(e.stamp_ns for e in measurements if isinstance(e, FrameSet)) + round(end_s * 1e9)
+    return [e for e in measurements if e.stamp_ns < end_ns]
+
+
 @pytest.fixture(scope="module")
 def clean(walk_folder: Path, measurements: list[Measurement]) -> Outcome:
     """Of the walk without any fault."""
@@ -140,9 +154,10 @@ def blackened(frameset: FrameSet) -> FrameSet:
 
 @pytest.mark.parametrize(("dark_s", "most_jump_m"), [(0.3, 0.01), (1.0, 0.03), (3.0, 0.3), (5.0, 0.8)])
 def test_a_blackout_is_coasted_through(
-    walk_folder: Path, measurements: list[Measurement], dark_s: float, most_jump_m: float
+    walk_folder: Path, long_measurements: list[Measurement], dark_s: float, most_jump_m: float
 ) -> None:
     end_s = START_S + dark_s
+    measurements = until(long_measurements, end_s + 1.5)
     done = outcome(walk_folder, altered(measurements, START_S, end_s, blackened))
     assert done.completion == 1.0
     dark = done.between(START_S, end_s)
@@ -159,10 +174,10 @@ def test_a_blackout_is_coasted_through(
     assert not {"lost", "new_epoch", "gate_reset", "window_rebuilt"} & set(done.kinds)
 
 
-def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, measurements: list[Measurement]) -> None:
+def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, long_measurements: list[Measurement]) -> None:
     """Lost is reported, no pose meanwhile, and the next epoch begins at the prediction with its covariance."""
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
-    done = outcome(walk_folder, altered(measurements, START_S, START_S + 3.0, blackened), config)
+    done = outcome(walk_folder, altered(long_measurements, START_S, START_S + 3.0, blackened), config)
     lost = [e for e in done.estimates if e.status is Status.LOST]
     assert lost
     assert all(e.nav_T_body is None and e.covariance is None and e.velocity_nav is None for e in lost)
@@ -221,9 +236,9 @@ def test_a_gap_of_the_imu_is_bridged_by_vision(
 ) -> None:
     done = outcome(walk_folder, altered(measurements, START_S, START_S + gap_s, sample=left_out))
     assert done.completion == 1.0
-    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
+    assert {e.status for e in done.between(1.0, END_S)} == {Status.TRACKING}
     assert done.largest_jump_m() < 0.01
-    assert done.error_m(2.0, 9.0) < 0.03
+    assert done.error_m(2.0, 6.5) < 0.03
     assert "imu_not_covering" in done.kinds
 
 
@@ -255,8 +270,8 @@ def test_nan_costs_only_its_samples(walk_folder: Path, measurements: list[Measur
 
     done = outcome(walk_folder, altered(measurements, START_S, 6.0, sample=spoiled))
     assert done.completion == 1.0
-    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
-    assert done.error_m(2.0, 9.0) < 0.03
+    assert {e.status for e in done.between(1.0, END_S)} == {Status.TRACKING}
+    assert done.error_m(2.0, 6.5) < 0.03
     assert done.kinds.count("imu_not_finite") == 150
 
 
@@ -286,9 +301,9 @@ def assert_left_to_vision(folder: Path, measurements: list[Measurement]) -> None
     done = outcome(folder, measurements)
     assert done.completion == 1.0
     assert done.kinds.count("imu_stuck") > 380
-    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
+    assert {e.status for e in done.between(1.0, END_S)} == {Status.TRACKING}
     assert done.largest_jump_m() < 0.01
-    assert done.error_m(2.0, 9.0) < 0.03
+    assert done.error_m(2.0, 6.5) < 0.03
 
 
 def test_an_axis_that_sticks_in_the_dark_is_not_believed(walk_folder: Path, measurements: list[Measurement]) -> None:
@@ -314,8 +329,8 @@ def test_a_gyro_at_the_end_of_its_range(walk_folder: Path, measurements: list[Me
 
     done = outcome(walk_folder, altered(measurements, START_S, 6.0, sample=cut))
     assert done.completion == 1.0
-    assert sum(e.status is not Status.TRACKING for e in done.between(1.0, 10.0)) < 10
-    assert done.error_m(2.0, 9.0) < 0.03
+    assert sum(e.status is not Status.TRACKING for e in done.between(1.0, END_S)) < 10
+    assert done.error_m(2.0, 6.5) < 0.03
     assert done.largest_jump_m() < 0.02
 
 
@@ -332,7 +347,7 @@ def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, measurements: lis
     assert done.kinds.count("time_jump") == 1
     assert [e.epoch for e in (done.estimates[0], done.estimates[-1])] == [0, 1]
     assert done.estimates[-1].status is Status.TRACKING
-    start, end = (e for e in (done.at(jump_s + 5.0), done.at(jump_s + 9.0)))
+    start, end = (e for e in (done.at(jump_s + 3.5), done.at(jump_s + 6.5)))
     assert start.nav_T_body is not None
     assert end.nav_T_body is not None
     motion = se3_inverse(start.nav_T_body) @ end.nav_T_body
@@ -341,26 +356,29 @@ def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, measurements: lis
 
 
 @pytest.mark.parametrize("offset_ms", [-10, 25])
-def test_an_unknown_time_offset_is_found(walk_folder: Path, measurements: list[Measurement], offset_ms: int) -> None:
+def test_an_unknown_time_offset_is_found(
+    walk_folder: Path, long_measurements: list[Measurement], offset_ms: int
+) -> None:
     """Of an IMU that stamps late or early. The first second is at a standstill, without information."""
     shifted = [
-        replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in measurements
+        replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e
+        for e in until(long_measurements, 8.0)
     ]
     shifted.sort(key=lambda e: (e.stamp_ns, isinstance(e, FrameSet)))
     config = Config.from_yaml("fusion: {estimate_time_offset: true}")
     as_written = Config.from_yaml("calibration: {online: false}")
-    ignored, found = outcome(walk_folder, shifted, as_written), outcome(walk_folder, shifted, config)
+    ignored, found = outcome(walk_folder, until(shifted, 5.0), as_written), outcome(walk_folder, shifted, config)
     assert all(e.time_offset_s is None for e in ignored.estimates)
-    found_estimates = [(e.time_offset_s, e.time_offset_sigma_s) for e in found.between(6.0, 10.0)]
+    found_estimates = [(e.time_offset_s, e.time_offset_sigma_s) for e in found.between(6.0, 8.0)]
     for offset_s, sigma_s in found_estimates:
         assert offset_s is not None
         assert sigma_s is not None
         assert sigma_s < 1e-3
         assert abs(offset_s - 1e-3 * offset_ms) < 4.0 * sigma_s
     assert found.kinds.count("time_offset_off") == 1
-    assert found.error_m(6.0, 9.0) < 0.03
+    assert found.error_m(6.0, 7.9) < 0.03
     assert "imu_left_out" in ignored.kinds  # which is what an offset comes to that nobody estimates
-    assert {e.status for e in found.between(6.0, 10.0)} == {Status.TRACKING}
+    assert {e.status for e in found.between(6.0, 8.0)} == {Status.TRACKING}
 
 
 @pytest.mark.parametrize("offset_ms", [-10, 25])
@@ -411,8 +429,8 @@ def test_half_of_the_framesets_are_enough(walk_folder: Path, measurements: list[
     rng = np.random.default_rng(0)
     done = outcome(walk_folder, altered(measurements, 0.5, 1e9, lambda f: f if rng.random() < 0.5 else None))
     assert done.completion == 1.0
-    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
-    assert done.error_m(2.0, 9.0) < 0.03
+    assert {e.status for e in done.between(1.0, END_S)} == {Status.TRACKING}
+    assert done.error_m(2.0, 6.5) < 0.03
 
 
 # ------------------------------------------------------------------ standing still
@@ -442,9 +460,9 @@ def test_images_alone_do_not_make_a_standstill(walk_folder: Path, measurements: 
 def test_ten_minutes_of_standing_drift_less_than_a_centimetre(
     walk_folder: Path, measurements: list[Measurement]
 ) -> None:
-    """Images of the first second, at a standstill, in random order, two a second; a synthetic IMU."""
+    """Images of the first second, at a standstill, in random order, one a second; a synthetic IMU."""
     source = open_source(walk_folder)
-    rng, start_ns, rate_hz = np.random.default_rng(0), source.start_ns, 100
+    rng, start_ns, rate_hz = np.random.default_rng(0), source.start_ns, 50
     assert source.rig.imu is not None
     imu = replace(source.rig.imu, rate_hz=float(rate_hz))
     still = [e for e in measurements if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
@@ -455,12 +473,12 @@ def test_ten_minutes_of_standing_drift_less_than_a_centimetre(
         stamp_ns = start_ns + 1000 * MS // rate_hz * i
         rate = gyro_bias + noise[0] * rng.standard_normal(3)
         found_estimates = [odometry.process(ImuSample(stamp_ns, rate, force + noise[1] * rng.standard_normal(3)))]
-        if i >= 0 and i % (rate_hz // 2) == 0:
+        if i >= 0 and i % rate_hz == 0:
             last = (last + 1 + int(rng.integers(len(still) - 1))) % len(still)  # never the same twice running
             found_estimates.append(odometry.process(replace(still[last], stamp_ns=stamp_ns)))
         estimates += [estimate for estimate in found_estimates if estimate is not None]
     odometry.finish()
-    assert len(estimates) >= 1199
+    assert len(estimates) >= 599
     assert np.mean([e.is_stationary for e in estimates]) > 0.9
     positions = np.array([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None])
     assert len(positions) == len(estimates)
