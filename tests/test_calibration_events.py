@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
+from real_clip import CLIP, real_clip
 
 from graphvio import Config, Odometry, open_source
 from graphvio.measurements.events import EventKind
-
-CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 
 
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_good_rig_file_is_not_reported_as_wrong() -> None:
     """Its calibration differs from the file's by less than its own standard deviations, but not by nothing."""
-    source = open_source(CLIP, to_s=6.0)
+    source = open_source(real_clip(), to_s=6.0)
     odometry = Odometry(source.rig, Config())
     for measurement in source:
         odometry.process(measurement)

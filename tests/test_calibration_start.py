@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from real_clip import CLIP, real_clip
 
 from graphvio import Config, Estimate, Odometry, open_source
 from graphvio.evaluation import evaluate
@@ -17,8 +18,6 @@ from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.sources.base import Source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
-
-CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 
 
 def with_lower_right_images(rig: Rig, rows_px: float) -> Rig:
@@ -60,11 +59,11 @@ def test_first_images_correct_epipolar_lines_that_are_rows_off(room_walk: Path, 
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 @pytest.mark.parametrize("rows_px", [-6.0, 4.0])
 def test_real_texture_that_looks_alike_by_chance_does_not_hide_lines_that_are_rows_off(rows_px: float) -> None:
-    source = open_source(CLIP)
+    source = open_source(real_clip())
     rig = with_lower_right_images(source.rig.without_imu(), rows_px)
     odometry = Odometry(rig, Config())
     estimates = [
-        estimate for estimate in map(odometry.process, open_source(CLIP, rig, to_s=3.0)) if estimate is not None
+        estimate for estimate in map(odometry.process, open_source(real_clip(), rig, to_s=3.0)) if estimate is not None
     ]
     estimates += odometry.finish()
     failed = [event for event in odometry.take_events() if event.kind in (EventKind.VISION_FAILED, EventKind.LOST)]
@@ -78,7 +77,7 @@ def test_imu_of_another_clock_is_kept_from_a_start_in_motion(draw_seed: int) -> 
     """The time offset is 8 ms off, and vision is refused until that is known: the IMU is corrected, not left out."""
     estimates, kinds = run_with_files_of_long_ago(draw_seed, 0.0, 5.0)
     assert not kinds & {EventKind.IMU_LEFT_OUT, EventKind.LOST, EventKind.VISION_FAILED}
-    assert ate_m(estimates, open_source(CLIP)) < 0.01
+    assert ate_m(estimates, open_source(real_clip())) < 0.01
 
 
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
@@ -89,21 +88,21 @@ def test_single_camera_does_not_begin_with_a_scale_by_files_that_it_contradicts(
     assert not kinds & {EventKind.LOST, EventKind.VISION_FAILED}
     poses = [estimate for estimate in estimates if estimate.nav_T_body is not None]
     assert len(poses) > 30
-    assert ate_m(poses, open_source(CLIP)) < 0.02
+    assert ate_m(poses, open_source(real_clip())) < 0.02
 
 
 def run_with_files_of_long_ago(
     draw_seed: int, from_s: float, to_s: float, cameras: list[str] | None = None
 ) -> tuple[list[Estimate], set[str]]:
     """Run a part of the clip by a rig file that is wrong, and an IMU with scale and misalignment."""
-    source = open_source(CLIP)
+    source = open_source(real_clip())
     error = draw(source.rig, CalibrationError.of_level(3), draw_seed)
     assert error.true_rig.imu is not None
     rig = replace(error.written_rig, imu=error.true_rig.imu)  # the samples are as they are, and the rig is off
     if cameras is not None:
         rig = rig.with_only(cameras)
     odometry, estimates = Odometry(rig, Config()), []
-    for measurement in open_source(CLIP, rig, from_s=from_s, to_s=to_s):
+    for measurement in open_source(real_clip(), rig, from_s=from_s, to_s=to_s):
         if isinstance(measurement, ImuSample):
             rate, force = measurement.angular_velocity, measurement.linear_acceleration
             measurement = ImuSample(measurement.stamp_ns, error.imu.gyro_matrix @ rate, error.imu.accel_matrix @ force)

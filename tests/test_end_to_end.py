@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 import pytest
 from command_line import Ran, graphvio, graphvio_alone
-from recordings import REAL_DATA
+from real_clip import CLIP, real_clip
 from undrawn import undrawn
 
 from graphvio import FrameSet, load_rig, open_source
 from graphvio.trajectory_files import load_trajectory
 
-CLIP = REAL_DATA / "euroc_mh01_clip"
 needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not next to the project")
 
 
@@ -64,7 +63,7 @@ def change_lines(path: Path, change: Any) -> None:
 def test_run_real_clip_started_in_motion_is_accurate(
     tmp_path: Path, options: tuple[str, ...], max_ate_m: float
 ) -> None:
-    summary = run(CLIP, tmp_path / "out", *options)
+    summary = run(real_clip(), tmp_path / "out", *options)
     assert summary["framesets"] == summary["estimated"] == 340
     assert summary["completion"] == 1.0
     assert summary["input_faults"] == {"frame_gap": 1}

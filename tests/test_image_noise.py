@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from real_clip import CLIP, real_clip
 from waves import picture, waves
 
 from graphvio import FrameSet, Odometry, open_source
@@ -15,7 +14,6 @@ from graphvio.frontend.image_noise import NoiseFilter, contrast, noise_sigma
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 X, Y = np.meshgrid(np.arange(320.0), np.arange(240.0))
 
 
@@ -61,10 +59,10 @@ def test_filter_smooths_both_images_while_one_is_noisy_and_leaves_clean_ones_alo
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_pair_alone_in_noise() -> None:
     """Noise of 15 grey levels hides most corners' likeness: unsmoothed, the path is wrong by half a metre."""
-    source = open_source(CLIP)
+    source = open_source(real_clip())
     rig = source.rig.without_imu()
     odometry, estimates = Odometry(rig), []
-    for measurement in open_source(CLIP, rig, to_s=12.0):
+    for measurement in open_source(real_clip(), rig, to_s=12.0):
         if isinstance(measurement, FrameSet):
             left, right = measurement.images[0]
             seed = measurement.stamp_ns % 2**32

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from real_clip import CLIP, real_clip
 from waves import picture, waves
 
 from graphvio import Config, FrameSet, Odometry, open_source
@@ -16,7 +15,6 @@ from graphvio.measurements.events import EventKind
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 FOCAL_PX = 400.0
 
 
@@ -48,9 +46,9 @@ def test_motion_of_found_tracks_foretells_the_others() -> None:
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_every_third_image_of_a_shaken_pair_without_imu() -> None:
     """At 7 Hz the velocity of one step says little about the next one: turns change by 3 degrees from step to step."""
-    source = open_source(CLIP)
+    source = open_source(real_clip())
     rig = source.rig.without_imu()
-    framesets = [each for each in open_source(CLIP, rig, to_s=12.0) if isinstance(each, FrameSet)]
+    framesets = [each for each in open_source(real_clip(), rig, to_s=12.0) if isinstance(each, FrameSet)]
     odometry = Odometry(rig, Config())
     estimates = [estimate for estimate in map(odometry.process, framesets[::3]) if estimate is not None]
     estimates += odometry.finish()

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
+from real_clip import CLIP, real_clip
 
 from graphvio import FrameSet, Imu, Odometry, open_source
 from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
@@ -21,7 +21,6 @@ from graphvio.odometry.stamp_jitter import StampJitter
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 PERIOD_NS = 50_000_000
 
 
@@ -94,10 +93,10 @@ def test_covariance_of_an_interval_covers_what_its_stamps_err_by() -> None:
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_images_that_are_stamped_when_they_arrive() -> None:
     """By intervals that are wrong by 4 ms, the IMU contradicted good images: it was left out, its scale corrected."""
-    source, rng = open_source(CLIP), np.random.default_rng(5)
+    source, rng = open_source(real_clip()), np.random.default_rng(5)
     measurements = [
         replace(each, stamp_ns=each.stamp_ns + int(rng.normal(0.0, 3e6))) if isinstance(each, FrameSet) else each
-        for each in open_source(CLIP, to_s=12.0)
+        for each in open_source(real_clip(), to_s=12.0)
     ]
     odometry = Odometry(source.rig)
     estimates = [odometry.process(each) for each in sorted(measurements, key=lambda each: each.stamp_ns)]
