@@ -63,17 +63,28 @@ def test_a_wrong_command_line_names_the_help_of_its_command(typed: list[str], hi
         ("graphvio serve v", {"v4l2"}),
     ],
 )
-def test_the_shell_completes(typed: str, found: set[str]) -> None:
+def test_the_shell_completes(typed: str, found: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in completing(typed).items():
+        monkeypatch.setenv(name, value)
+    ran = graphvio()
+    assert set(ran.stdout.split()) == found, ran.stderr
+
+
+def completing(typed: str) -> dict[str, str]:
+    """What a shell sets where it asks for completions."""
+    return {"_GRAPHVIO_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+
+
+def test_the_shell_completes_by_a_process_of_its_own() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "graphvio"],
-        env=os.environ
-        | {"_GRAPHVIO_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))},
+        env=os.environ | completing("graphvio cal"),
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
-    assert set(done.stdout.split()) == found, done.stderr
+    assert set(done.stdout.split()) == {"calibrate", "calibrate-trajectories"}, done.stderr
 
 
 def _without_matplotlib(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
