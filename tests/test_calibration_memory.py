@@ -42,9 +42,9 @@ def live(source: str, *arguments: object) -> Any:
     return done.output
 
 
-def test_live_begins_with_what_the_last_run_of_the_device_learnt(vga_walk: Path, tmp_path: Path, folder: Path) -> None:
-    simulator = f"simulator:room?recording={vga_walk}&legs=1&speed=max"
-    true = load_rig(vga_walk)
+def test_live_begins_with_what_the_last_run_of_the_device_learnt(room_walk: Path, tmp_path: Path, folder: Path) -> None:
+    simulator = f"simulator:room?recording={room_walk}&legs=1&speed=max"
+    true = load_rig(room_walk)
     rig = wrong(tmp_path / "rig.yaml", true, 0)
     first = live(simulator, "--rig", rig)
     assert KEPT in first
