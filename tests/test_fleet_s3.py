@@ -42,7 +42,7 @@ def endpoint() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def recordings(endpoint: str, tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = recorded(tmp_path_factory.mktemp("s3") / "walk", 1.0)
+    folder = recorded(tmp_path_factory.mktemp("s3") / "walk", 0.7)
     files, _ = file_system("s3://fleet")
     files.makedirs("fleet")
     for name in ("one", "two"):
@@ -60,7 +60,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_fleet_in_s3_survives_a_killed_worker(recordings: str, config: Path, tmp_path: Path) -> None:
     listed = list_sessions(recordings)
     assert [each.name for each in listed] == ["one", "two"]
-    with local_cluster() as cluster:
+    with local_cluster("extracting_here.py") as cluster:
         killer = Killer(cluster, after=1)
         outcomes = optimize_fleet(
             listed, "s3://fleet/results", Config.load(config), scheduler=cluster.scheduler_address, on_progress=killer,
