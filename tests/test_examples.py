@@ -153,6 +153,7 @@ def test_calibrate_two_odometries(tmp_path: Path) -> None:
     assert distance_mm < 20.0
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_batch_to_colmap(room_walk: Path, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is not installed: the extra maps")
     printed = _run("batch_to_colmap.py", room_walk, "optimized", folder=tmp_path)

@@ -50,6 +50,7 @@ def test_accelerometer_in_other_units_is_reported(force: float, faults: int, tmp
     assert log.counts.get(EventKind.IMU_UNITS, 0) == faults
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_run_says_what_to_check_where_the_imu_contradicts_vision(tmp_path: Path) -> None:
     walk = rendered_walk()
     (tmp_path / "own").mkdir()

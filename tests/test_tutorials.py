@@ -50,6 +50,7 @@ def test_calibrate_your_rig_as_typed(tmp_path: Path) -> None:
         assert (tmp_path / name).exists(), name
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_before_your_slam_as_typed(room_walk: Path, tmp_path: Path) -> None:
     printed = follow("before-your-slam", room_walk, tmp_path)
     assert "accepted" in printed
@@ -60,6 +61,7 @@ def test_before_your_slam_as_typed(room_walk: Path, tmp_path: Path) -> None:
     assert in_map == pytest.approx([10.0 - odom[1], odom[0], odom[2]], abs=0.05)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_session_to_colmap_as_typed(room_walk: Path, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     printed = follow("session-to-colmap", room_walk, tmp_path)
