@@ -25,7 +25,7 @@ IMU = Imu(accel_random_walk=1e-5, gyro_random_walk=1e-7)  # biases are sampled o
 PERIOD_NS = 200_000_000  # a keyframe then lasts long enough that errors look different from its two ends
 KEYFRAMES = 5  # framesets from one to the next
 FIRST, FRAMES = 2, 20  # the pose is composed from the first of these over so many: between two that are no keyframes
-SEEDS = 100
+SEEDS = 60
 SCALE = np.diag(np.repeat([2e-3, 4e-3], 3))
 SHARED, OWN = (
     SCALE @ random_covariance(np.random.default_rng(number), 6, sigma) @ SCALE for number, sigma in ((1, 1.0), (2, 0.4))

@@ -109,7 +109,7 @@ def test_whitened_matches_numerical_derivatives() -> None:
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.3, 0.6])
 def test_both_methods_errors_are_within_covariance(outlier_share: float) -> None:
-    runs = 24
+    runs = 16
     squares, differences, kept, missed = [], [], 0, 0
     for seed in range(runs):
         made: SyntheticPairs = synthetic_pairs(150, np.random.default_rng([seed, 1]), ANGLE, STEP_M, outlier_share)
