@@ -209,7 +209,7 @@ def test_calibrate_pairs_callback_ends_recording(walk: Path) -> None:
 
 
 def test_guide_more_motion_improves_advice(walk: Path) -> None:
-    advice = guided(walk)
+    advice, _ = guided(walk)
     assert not advice[0].is_enough
     assert "turn the rig about two axes" in advice[0].text
     assert not advice[-1].is_enough  # accurate enough, but from six seconds only
@@ -220,7 +220,8 @@ def test_guide_more_motion_improves_advice(walk: Path) -> None:
 
 
 def test_calibrate_pairs_repeated_gives_same_bits(walk: Path, found: Calibration) -> None:
-    again = calibrate_pairs(walk)
+    """Also where it is looked at while it goes on."""
+    _, again = guided(walk)
     np.testing.assert_array_equal(again.left2_T_left1, found.left2_T_left1)
     np.testing.assert_array_equal(again.covariance, found.covariance)
 
@@ -289,7 +290,7 @@ def test_command_invalid_options_are_refused(walk: Path, arguments: list[str], w
 
 
 @cache
-def guided(walk: Path) -> list[Advice]:
+def guided(walk: Path) -> tuple[list[Advice], Calibration]:
     source = open_source(walk)
     guide = Guide([pair.name for pair in source.rig.pairs])
     advice = []
@@ -299,8 +300,7 @@ def guided(walk: Path) -> list[Advice]:
             advice.append(guide.advise(separate.motions()))
         return False
 
-    calibrate_pairs(source, config=Config(), on_frameset=follow)
-    return advice
+    return advice, calibrate_pairs(source, config=Config(), on_frameset=follow)
 
 
 def test_sigmas_from_same_pose_are_zero(found: Calibration) -> None:
