@@ -145,7 +145,7 @@ def test_a_longer_lag_and_more_iterations_come_nearer_to_the_batch() -> None:
     """All measurements at once, iterated to convergence, have one solution; the filter is farther from it."""
     rng = np.random.default_rng(1)
     start = FilterState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    steps = list(synthetic_steps(rng, start, 60))
+    steps = list(synthetic_steps(rng, start, 40))
     running, candidates = ExtendedKalmanFilter(start, START), []
     for step in steps:  # what passes the filter's gates is given to all
         running.predict(DT, SIGMAS)
