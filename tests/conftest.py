@@ -81,3 +81,19 @@ def vga_walk() -> Path:
     from graphvio.simulation import simulate
 
     return rendered_once("room", lambda folder: simulate("room", folder, duration_s=5.0, seed=3), "640x480", 5.0)
+
+
+@pytest.fixture(scope="session")
+def stereo_and_back_walk() -> Path:
+    """Six seconds in the room, the first at a standstill: a pair and a camera that looks back, of 320x240."""
+    from recordings import half_size
+    from rendered import rendered_once
+
+    from graphvio.simulation import Simulator, build_scene, write_recording
+    from graphvio.simulation.named_rigs import stereo_and_back
+
+    def write(folder: Path) -> None:
+        rig = stereo_and_back().with_cameras(half_size)
+        write_recording(Simulator(build_scene("room", 6.0), rig, 1), folder)
+
+    return rendered_once("room-stereo-back", write, "320x240", 6.0)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from command_line import graphvio
 from recordings import half_size
-from rendered import rendered_once
 from undrawn import undrawn
 
 from graphvio import FrameSet, Odometry, RigError, load_rig, load_trajectory, save_rig
@@ -21,7 +20,7 @@ from graphvio.results.summary import Summary
 from graphvio.rig import Rig, SingleCamera, overlap
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.sessions.euroc_writer import EurocWriter
-from graphvio.simulation import CalibrationError, Simulator, build_scene, write_recording
+from graphvio.simulation import CalibrationError
 from graphvio.simulation.calibration_error import draw
 from graphvio.simulation.named_rigs import NAMED_RIGS, stereo_and_back
 from graphvio.sources import open_source
@@ -34,11 +33,8 @@ def half_size_stereo_and_back() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def walk() -> Path:
-    def write(folder: Path) -> None:
-        write_recording(Simulator(build_scene("room", DURATION_S), half_size_stereo_and_back(), 1), folder)
-
-    return rendered_once("room-stereo-back", write, "320x240", DURATION_S)
+def walk(stereo_and_back_walk: Path) -> Path:
+    return stereo_and_back_walk
 
 
 def summary_of(recording: Path, rig: Rig, out: Path, config: Config | None = None) -> Summary:
