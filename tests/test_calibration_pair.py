@@ -1,5 +1,6 @@
 """Calibration of two pairs from the motion that each measures."""
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,7 @@ def segments(walk: Walk, seed: int, moved: Float | None = None) -> Segments:
     return all_segments(one.stamps_ns.tolist(), [one.between, other.between])
 
 
+@cache
 def calibrated(walk: Walk, seed: int) -> PairCalibration:
     return calibrate_pair(segments(walk, seed))
 
