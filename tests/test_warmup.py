@@ -71,9 +71,9 @@ from graphvio.warmup import warm_up
 
 which, recording = sys.argv[1:]
 rig = draw(open_source(recording).rig, CalibrationError.of_level(3, ["pair-transform"]), 1).written_rig
-rig = {"singles": rig.without_pairs, "without_imu": rig.without_imu}.get(which, lambda: rig)()
-if which == "pair_and_single":
+if which in ("singles", "pair_and_single"):
     rig = rig.with_only(["0", "1", "2"])
+rig = {"singles": rig.without_pairs, "without_imu": rig.without_imu}.get(which, lambda: rig)()
 warm_up(rig, Config())
 before = compiled()
 assert len(before) > 20
