@@ -113,7 +113,7 @@ def test_calibrate_recording_finds_all_parameters(walk: Path) -> None:
 
 
 def test_calibrate_recording_of_single_cameras_finds_lenses_and_places(walk: Path) -> None:
-    true = load_rig(walk).without_pairs()
+    true = load_rig(walk).with_only(["0", "1", "2"]).without_pairs()
     written = draw(
         true, CalibrationErrors.of_level(2, ["principal-point", "cameras-in-body", "time-offset"]), 1
     ).written_rig
@@ -136,7 +136,7 @@ def test_command_left_to_right_of_single_cameras_is_refused(walk: Path) -> None:
 
 
 def test_calibrate_recording_of_one_group_keeps_the_others(walk: Path) -> None:
-    source, true = open_source(walk), load_rig(walk)
+    source, true = open_source(walk, to_s=8.0), load_rig(walk)
     written = draw(true, CalibrationErrors.of_level(2, ["left-right-rotation", "pair-transform"]), 2).written_rig
     found = calibrate_recording(source, written, "stereo")
     before, after = rms(written, true), rms(found.rig, true)
