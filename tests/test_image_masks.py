@@ -73,7 +73,7 @@ def test_a_mask_over_a_third_of_each_image_costs_little_accuracy(room_walk: Path
     assert truth_file is not None
     ates_m: dict[bool, list[float]] = {False: [], True: []}
     for is_masked, pairs in itertools.product(ates_m, ((0, 1), (0,), (1,))):
-        estimates = estimates_of(room_walk, standing if is_masked else None, pairs=pairs)
+        estimates = estimates_of(room_walk, standing if is_masked else None, 80, pairs=pairs)
         posed = [e for e in estimates if e.nav_T_body is not None]
         poses: Float = np.array([e.nav_T_body for e in posed])
         estimated = Trajectory(np.array([e.stamp_ns for e in posed], dtype=np.int64), poses)
