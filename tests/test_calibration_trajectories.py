@@ -183,7 +183,9 @@ def test_clock_relation_maps_stamps() -> None:
 @pytest.mark.skipif(not (REAL_DATA / "tango_triplet").is_dir(), reason="shared/data/tango_triplet is not here")
 def test_calibrate_trajectories_real_devices_close_loop() -> None:
     files: list[Path] = sorted((REAL_DATA / "tango_triplet").glob("*.csv"))
-    found = calibrate_trajectories([load_trajectory(file) for file in files], [file.stem[:6] for file in files])
+    whole = [load_trajectory(file) for file in files]
+    begins = [each.select(slice(0, 3 * len(each) // 4)) for each in whole]
+    found = calibrate_trajectories(begins, [file.stem[:6] for file in files])
     (loop,) = found.places.loops
     assert np.rad2deg(np.linalg.norm(loop.error[:3])) < 0.3
     assert np.linalg.norm(loop.error[3:]) < 0.012

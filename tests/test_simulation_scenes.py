@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from recordings import half_size_rig
 
 from graphvio.arrays import Image
 from graphvio.errors import SourceError
@@ -13,6 +14,12 @@ STRENGTH = 1e-3  # smallest eigenvalue of a corner that stands out from the nois
 @pytest.fixture(scope="module")
 def corridor() -> Simulator:
     return make_simulator("corridor", duration_s=42.0)
+
+
+@pytest.fixture(scope="module")
+def small_corridor() -> Simulator:
+    """Of images with a quarter of the pixels, for shares of them."""
+    return make_simulator("corridor", duration_s=42.0, rig=half_size_rig())
 
 
 def corners(image: Image) -> int:
@@ -77,18 +84,21 @@ def test_corridor_bend_blinds_both_pairs(corridor: Simulator) -> None:
         assert max(corners(corridor.image(at(corridor, time_s), camera)) for camera in (0, 2)) > 40
 
 
-def test_corridor_door_fills_front_view(corridor: Simulator) -> None:
-    start, end = corridor.scene.events["door"]
-    seen = [corridor.view(at(corridor, t), 0).is_moving.mean() for t in np.linspace(start, end, 6)]
+def test_corridor_door_fills_front_view(small_corridor: Simulator) -> None:
+    start, end = small_corridor.scene.events["door"]
+    seen = [small_corridor.view(at(small_corridor, t), 0).is_moving.mean() for t in np.linspace(start, end, 6)]
     assert max(seen) > 0.2
-    first, second = (corridor.surfaces(at(corridor, t)).corners for t in (start + 0.5, start + 0.8))
+    first, second = (small_corridor.surfaces(at(small_corridor, t)).corners for t in (start + 0.5, start + 0.8))
     assert np.abs(first - second).max() > 0.05
 
 
-def test_corridor_people_pass_both_pairs(corridor: Simulator) -> None:
-    start, end = corridor.scene.events["people"]
+def test_corridor_people_pass_both_pairs(small_corridor: Simulator) -> None:
+    start, end = small_corridor.scene.events["people"]
     for camera in (0, 2):
-        seen = [corridor.view(at(corridor, t), camera).is_moving.mean() for t in np.arange(start + 2, end - 2, 0.5)]
+        seen = [
+            small_corridor.view(at(small_corridor, t), camera).is_moving.mean()
+            for t in np.arange(start + 2, end - 2, 0.5)
+        ]
         assert max(seen) > 0.1
 
 
