@@ -281,9 +281,8 @@ def stuck(sample: ImuSample, axis: int) -> ImuSample:
     return ImuSample(sample.stamp_ns, rate, force)
 
 
-@pytest.mark.parametrize("axis", [0, 2])
-def test_an_axis_that_sticks_is_left_to_vision(walk_folder: Path, measurements: list[Measurement], axis: int) -> None:
-    assert_left_to_vision(walk_folder, altered(measurements, START_S, START_S + 2.0, sample=lambda s: stuck(s, axis)))
+def test_an_axis_that_sticks_is_left_to_vision(walk_folder: Path, measurements: list[Measurement]) -> None:
+    assert_left_to_vision(walk_folder, altered(measurements, START_S, START_S + 2.0, sample=lambda s: stuck(s, 0)))
 
 
 def test_an_imu_that_repeats_itself_is_left_to_vision(walk_folder: Path, measurements: list[Measurement]) -> None:
