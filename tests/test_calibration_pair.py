@@ -27,7 +27,7 @@ def calibrated(walk: Walk, seed: int) -> PairCalibration:
 
 
 def test_calibrate_pair_errors_are_within_covariance() -> None:
-    runs = 10
+    runs = 8
     found = [calibrated(turning, seed) for seed in range(runs)]
     low, high = band(runs)
     assert low < np.mean([each.distance(LEFT2_T_LEFT1) for each in found]) < high

@@ -144,7 +144,7 @@ def test_plot_while_running(room_walk: Path, tmp_path: Path) -> None:
 
 
 def test_calibrate_two_odometries(tmp_path: Path) -> None:
-    turns = recorded(tmp_path / "turns", 12.0)
+    turns = recorded(tmp_path / "turns", 8.0)
     printed = _run("calibrate_two_odometries.py", turns, folder=tmp_path)
     (ahead,) = _numbers(r"clock is ([\d.]+) s ahead", printed)
     assert ahead == pytest.approx(12.345, abs=2e-3)

@@ -162,7 +162,7 @@ def walked(seed: int, accel_m_s2: float, hertz: float) -> Outcome:
 @pytest.mark.parametrize(("accel_m_s2", "hertz"), [(1.0, 0.5), (5.0, 0.5), (5.0, 0.16), (15.0, 1.0)])
 def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: float) -> None:
     """On foot, in a take-off or a braking of a second, and shaken; the mean force is up to 40 deg off the vertical."""
-    outcomes = [walked(seed, accel_m_s2, hertz) for seed in range(8)]
+    outcomes = [walked(seed, accel_m_s2, hertz) for seed in range(6)]
     for out in outcomes:
         assert out.initialised_s <= 1.0  # asked for: 2 s
         k = round(out.initialised_s / STEP_S)
@@ -180,7 +180,7 @@ def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: fl
 @pytest.mark.parametrize(("accel_m_s2", "hertz"), [(1.0, 0.5), (5.0, 0.5), (15.0, 1.0)])
 def test_gravity_turns_and_the_poses_do_not(accel_m_s2: float, hertz: float) -> None:
     """What is level is learnt by many degrees, and the motion from the first pose is right all along."""
-    outcomes = [walked(seed, accel_m_s2, hertz) for seed in range(8)]
+    outcomes = [walked(seed, accel_m_s2, hertz) for seed in range(6)]
     learnt = [out.tilt_deg[0] - out.tilt_deg[-1] for out in outcomes]
     assert max(learnt) > (1.0 if accel_m_s2 == 1.0 else 10.0)
     for out in outcomes:
@@ -199,7 +199,7 @@ def test_level_is_known_as_well_as_it_is_said_to_be() -> None:
 def test_imu_makes_poses_no_worse() -> None:
     """The same motions with and without the IMU, started in motion."""
     ratios = []
-    for seed in range(10):
+    for seed in range(8):
         one, other = (run(seed, 2.0, 0.5, with_imu=with_imu) for with_imu in (True, False))
         ratios.append(np.sqrt(np.mean(np.square(one.moved_m)) / np.mean(np.square(other.moved_m))))
     assert np.median(ratios) < 1.05
