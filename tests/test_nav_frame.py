@@ -23,7 +23,7 @@ from graphvio.slam.keyframe import Keyframe as SlamKeyframe
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-SECONDS = 9.0
+SECONDS = 12.0
 OLD_R_NEW = so3_exp(np.array([0.02, -0.01, 0.03]))
 POSE = se3(so3_exp(np.array([0.3, -0.2, 1.1])), np.array([4.0, -2.0, 1.0]))
 LATER = se3(so3_exp(np.array([-0.1, 0.4, 2.0])), np.array([5.0, -1.0, 1.2]))
