@@ -644,7 +644,7 @@ def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_
 ) -> None:
     rig, errors = overlapping_rig(), []
     trusting = replace(Config(), calibration=CalibrationConfig(online=False))
-    for seed in (0, 2):
+    for seed in range(2):
         true_difference, written = wrong_by(rig, seed)
         flown = fly(moving(), 8.0, fewer, rig=rig, believed=written, seed=5 + seed)
         estimate = flown.estimator.calibration
