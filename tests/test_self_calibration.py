@@ -470,6 +470,19 @@ def test_self_calibration_with_imu_finds_time_offset_and_cameras_in_body() -> No
     assert angle_deg(after) < 0.3 * angle_deg(before)
 
 
+@pytest.mark.parametrize("offset_ms", [-8.0, 8.0])
+def test_self_calibration_with_an_imu_that_begins_with_the_images_finds_a_time_offset_of_either_sign(
+    offset_ms: float,
+) -> None:
+    # They end with the newest keyframe, or begin with the first one, and do not cover it by the offset that is found.
+    for seed in range(4):
+        error = draw(default_rig(), CalibrationError.of_level(3, CAMERAS), seed)
+        assert error.true_rig.imu is not None
+        true = replace(error.true_rig, imu=replace(error.true_rig.imu, time_offset_s=1e-3 * offset_ms))
+        found = calibrated(SelfCalibration(error.written_rig), Walk(true, seed=seed), 1.0).estimate
+        assert 1e3 * found.time_offset_s == pytest.approx(offset_ms, abs=0.3)
+
+
 def test_self_calibration_whose_steps_were_refused_does_not_claim_to_know_the_cameras_in_body() -> None:
     # The clock's offset moves an end of the IMU's samples: in some of these, steps that lose an interval are refused.
     components = [*CAMERAS, "cameras-in-body", "time-offset", "imu-noise"]

@@ -21,6 +21,8 @@ _MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe:
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
 _MAX_IMU_GAP_NS = 50_000_000
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
+_HELD_NS = 30_000_000  # by which time offsets of rig files may be wrong
+_HELD_NOISE_FACTOR = 100.0  # on the variance of a reading that is held
 _KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
 
 
@@ -99,7 +101,7 @@ class WindowCollector:
         stamps = np.array([sample.stamp_ns - self._imu.time_offset_ns for sample in self._samples])
         values = np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in self._samples])
         noise = np.maximum(_IMU_NOISE_FACTOR * self._imu.noise_densities, shown_noise(stamps, values, _MAX_IMU_GAP_NS))
-        return InertialSamples(
+        samples = InertialSamples(
             stamps,
             values,
             np.array([keyframe.stamp_ns for keyframe in window]),
@@ -107,6 +109,23 @@ class WindowCollector:
             _MAX_IMU_GAP_NS,
             np.ones((len(stamps), 2)),
         )
+        return _with_held_ends(samples)
+
+
+def _with_held_ends(samples: InertialSamples) -> InertialSamples:
+    """Return samples whose first and last readings are held for longer, where a time offset may ask for that.
+
+    An IMU that begins with the images, or the last frameset, would else lose an interval as the offset is found.
+    """
+    stamps, readings, factors = samples.stamps_ns, samples.readings, samples.noise_factors
+    if stamps[0] > samples.keyframes_ns[0] - _HELD_NS:
+        stamps, readings = np.r_[stamps[0] - _HELD_NS, stamps], np.concatenate([readings[:1], readings])
+        factors = np.concatenate([np.full((1, 2), _HELD_NOISE_FACTOR), factors])
+    if stamps[-1] < samples.keyframes_ns[-1] + _HELD_NS:
+        stamps, readings = np.r_[stamps, stamps[-1] + _HELD_NS], np.concatenate([readings, readings[-1:]])
+        factors = np.concatenate([factors, factors[-1:]])
+        factors[-2:] = _HELD_NOISE_FACTOR
+    return samples._replace(stamps_ns=stamps, readings=readings, noise_factors=factors)
 
 
 def _noise_of_stamps(window: tuple[Keyframe, ...], rates: Float, sigma_s: float) -> Float:
