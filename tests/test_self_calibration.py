@@ -19,7 +19,7 @@ from graphvio.linear_algebra import eliminated, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
-from graphvio.self_calibration import online
+from graphvio.self_calibration import online, solver
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
 from graphvio.self_calibration.collector import FullWindow, WindowCollector
@@ -384,6 +384,18 @@ def test_self_calibration_leaves_out_what_cannot_be_solved(failure: str, monkeyp
     assert found.has_full_window
     assert found.estimate.is_file_exact
     assert np.isfinite(found.estimate.posterior.mean).all()
+
+
+def test_self_calibration_leaves_out_windows_whose_adjustment_has_not_converged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    error = draw(default_rig().without_imu(), CalibrationError.of_level(3, CAMERAS), 0)
+    monkeypatch.setattr(solver, "_MAX_STEPS", 1)
+    found = calibrated(SelfCalibration(error.written_rig), Walk(error.true_rig), 3.0)
+    assert not found.has_full_window
+    assert not found.estimate.posterior.mean.any()
+    monkeypatch.undo()
+    assert calibrated(SelfCalibration(error.written_rig), Walk(error.true_rig), 3.0).has_full_window
 
 
 def test_self_calibration_at_a_standstill_keeps_few_samples() -> None:

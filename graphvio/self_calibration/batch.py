@@ -34,7 +34,7 @@ class Batch(NamedTuple):
         evidence: of all windows that are used.
         prior: of the rig file.
         history: the estimate from longer and longer beginnings of the recording, with the stamp of their end.
-        left_out: (K,) whether each window contradicts the others and is not used.
+        left_out: (K,) whether each window is not used: it contradicts the others, or its adjustment has not converged.
     """
 
     estimate: CalibrationEstimate
@@ -72,7 +72,8 @@ def calibrate_windows(
             others = _sum(earlier, later[k]).given(prior, factors)
             start = difference if number == 0 else others.mean
             solution = adjusted(window.keyframes, window.samples, nominal, start, others, window.sigma_px)
-            left_out[k] = number > 0 and not others.is_confirmed_by(solution.calibration)
+            contradicts = number > 0 and not others.is_confirmed_by(solution.calibration)
+            left_out[k] = contradicts or not solution.has_converged
             sites[k] = Evidence.none(len(difference)) if left_out[k] else _site(others, solution.calibration)
             earlier = _sum(earlier, sites[k])
             history.append((window.keyframes[-1].stamp_ns, _estimate(rig, prior, earlier)))

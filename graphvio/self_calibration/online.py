@@ -210,6 +210,8 @@ class SelfCalibration:
         except RigError:
             return False  # an IMU that is no IMU of any rig: its measurements are wrong
         prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
+        if not solution.has_converged:
+            return False
         if self.has_full_window and not prior.is_confirmed_by(solution.calibration):
             self._refuse(is_full)
             return False

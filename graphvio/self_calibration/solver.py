@@ -17,7 +17,7 @@ from graphvio.self_calibration.inertial import InertialSamples, InertialStates, 
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
 _ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
-_MAX_STEPS = 6
+_MAX_STEPS = 25  # far points, by the rig file, may be anywhere at first
 _CONVERGED = 0.05  # standard deviations of the prior
 _LOOSE_ROTATION_SIGMA, _LOOSE_POSITION_SIGMA = np.deg2rad(5.0), 0.3  # keep poses that no track constrains
 _LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
@@ -66,6 +66,7 @@ class Solution(NamedTuple):
         errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
         imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
         hessian: of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
+        has_converged: whether the last step hardly changed the calibration; else it is no minimum, and says nothing.
     """
 
     states: States
@@ -73,6 +74,7 @@ class Solution(NamedTuple):
     errors2: Float
     imu_errors2: Float
     hessian: Float
+    has_converged: bool
 
     def poses_by_cameras(self, n_cameras: int) -> Float:
         """Return how the poses depend on the cameras' parameters, the first ones of the calibration.
@@ -112,6 +114,7 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
     damping = _FIRST_DAMPING
     at, damping_at = _linearise(window, states, first, nominal, difference, prior, damping, found), damping
     calibration = slice(6 * len(states.poses), 6 * len(states.poses) + len(difference))
+    has_converged = False
     for _ in range(_MAX_STEPS):
         damped = at.hessian + damping * np.diag(np.diag(at.hessian))
         step = -solve_symmetric(damped, at.gradient)
@@ -124,7 +127,8 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:
             window, states, difference, at, damping_at = following, moved, changed, new, damping
-            if np.abs(step[calibration] / sigmas).max() < _CONVERGED:
+            has_converged = bool(np.abs(step[calibration] / sigmas).max() < _CONVERGED)
+            if has_converged:
                 break
         else:
             found, damping = kept, max(100.0 * damping, 1e-4)
@@ -132,7 +136,7 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         found = Eliminated.empty(window.tracks)
         at = _linearise(window, states, first, nominal, difference, prior, _MIN_DAMPING, found)
     posterior = Gaussian(difference, _marginal(at.hessian, calibration))
-    return Solution(states, posterior, at.errors2, at.imu_errors2, at.hessian)
+    return Solution(states, posterior, at.errors2, at.imu_errors2, at.hessian, has_converged)
 
 
 def _linearise(
