@@ -24,6 +24,8 @@ _LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
 _LOOSE_SCALE_SIGMA = 5.0  # of distances and velocities: where all points are far, wrong cameras see a wrong scale
 _FIXED = 1e-9
 _FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
+_MAX_LAST_DAMPING = 1e-5  # a step that more damping makes small does not say that this is the minimum
+_ROUNDING = 1e-9  # of the cost, relative
 _GRAVITY_NORM_SIGMA = 5e-3
 
 
@@ -118,6 +120,7 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
     for _ in range(_MAX_STEPS):
         damped = at.hessian + damping * np.diag(np.diag(at.hessian))
         step = -solve_symmetric(damped, at.gradient)
+        is_small = damping <= _MAX_LAST_DAMPING and np.abs(step[calibration] / sigmas).max() < _CONVERGED
         following, moved = _moved(window, states, nominal, difference, found, step)
         changed = difference + step[calibration]
         kept = found
@@ -125,13 +128,13 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         damping = max(0.1 * damping, _MIN_DAMPING)
         new = _linearise(following, moved, first, nominal, changed, prior, damping, found)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
+        has_converged = bool(is_small and new.cost <= (1.0 + _ROUNDING) * at.cost and not loses_intervals)
         if new.cost <= at.cost and not loses_intervals:
             window, states, difference, at, damping_at = following, moved, changed, new, damping
-            has_converged = bool(np.abs(step[calibration] / sigmas).max() < _CONVERGED)
-            if has_converged:
-                break
         else:
             found, damping = kept, max(100.0 * damping, 1e-4)
+        if has_converged:
+            break
     if damping_at > _MIN_DAMPING:  # damped landmarks hold the cameras, as if their attitude in body were known
         found = Eliminated.empty(window.tracks)
         at = _linearise(window, states, first, nominal, difference, prior, _MIN_DAMPING, found)
