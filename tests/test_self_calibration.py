@@ -1,7 +1,7 @@
 """Self-calibration on tracks without images: what it finds, how certain it is, and what it must leave alone."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -533,13 +533,16 @@ def test_solve_late_clock_does_not_drop_intervals_that_the_samples_cover() -> No
     assert np.isfinite(solution.imu_errors2).all()
 
 
+@dataclass
 class Flight(Walk):
-    """A flight at 12 m/s in a curve, with all points 60 to 200 m away: disparities are a pixel or less."""
+    """A flight at 12 m/s in a curve, with points 60 to 200 m away, or farther: disparities are a pixel or less."""
+
+    farther: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._motion = Motion(self._course, 6.0)
-        self._points = self._rng.uniform([80.0, -90.0, -60.0], [200.0, 90.0, 60.0], (2000, 3))
+        self._points = self.farther * self._rng.uniform([80.0, -90.0, -60.0], [200.0, 90.0, 60.0], (2000, 3))
 
     @staticmethod
     def _course(t: Float) -> Float:
@@ -567,6 +570,24 @@ def test_adjusted_window_of_far_points_does_not_keep_the_scale_of_the_first_pose
         found_m.append(float(np.linalg.norm(solution.states.poses[-1, :3, 3] - solution.states.poses[0, :3, 3])))
     assert found_m == pytest.approx([true_m] * 2, rel=0.02)
     assert found_m[0] == pytest.approx(found_m[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("farther", [3.0, 10.0])
+def test_adjustments_of_points_that_are_nearly_infinite_converge(
+    farther: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solutions = []
+
+    def keep(*arguments: Any) -> Solution:
+        solutions.append(adjusted(*arguments))
+        return solutions[-1]
+
+    monkeypatch.setattr(online, "adjusted", keep)
+    for seed in (1, 2, 3):
+        error = draw(default_rig(), CalibrationError.of_level(3, CAMERAS), seed)
+        calibrated(SelfCalibration(error.written_rig), Flight(error.true_rig, seed=seed, farther=farther), 2.5)
+    assert len(solutions) > 10
+    assert all(solution.has_converged for solution in solutions)
 
 
 # ---------------------------------------------------------------- what users see

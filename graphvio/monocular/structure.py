@@ -117,8 +117,8 @@ def landmarks_after(
         first = structure.rows[point]
         k, body_T_cam = structure.state[first], cameras.body_T_cam[structure.camera[first]]
         if moved_with_camera(
-            frames[point], landmarks[point], by, poses[k], body_T_cam, step[POSE * k : POSE * k + POSE], work,
-            moved[point],
+            frames[point], landmarks[point], by, poses[k], body_T_cam, step[POSE * k : POSE * k + POSE],
+            np.inf, work, moved[point],
         ):  # fmt: skip
             frames[point] = se3_compose(moved_poses[k], body_T_cam)
         else:

@@ -215,8 +215,8 @@ def calibrate_recording(
     batch = calibrate_windows(prior_rig, windows, online.posterior.mean, lambda k, n: on_progress("all windows", k, n))
     if sum(batch.left_out) > len(windows) // 2:
         raise CalibrationError(
-            f"{sum(batch.left_out)} of {len(windows)} windows contradict the others: did the calibration change on the "
-            "way, or is what is kept as in the file wrong (--what all)?"
+            f"{sum(batch.left_out)} of {len(windows)} windows contradict the others, or fit no calibration: did it "
+            "change on the way, or is what is kept as in the file wrong (--what all)?"
         )
     if len(windows) < _MIN_OF_HALVES or not compares_halves:
         return RecordedCalibration(what, rig, batch, None, *judged)

@@ -19,6 +19,7 @@ from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, POINT, POIN
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
 _ERROR2_BEHIND = 1e6  # of a landmark behind the camera
+_MAX_FARTHER = 0.5  # see `moved_with_camera`: stereo cameras see points that are nearly infinite
 
 
 class Tracks(NamedTuple):
@@ -323,8 +324,8 @@ def landmarks_after(
                 by[r] -= eliminated.inverse[point, r, c] * b[c]
         k, body_T_left = tracks.keyframe[first], calibration.body_T_left[tracks.pair[point]]
         if moved_with_camera(
-            frames[point], landmarks[point], by, poses[k], body_T_left, step[POSE * k : POSE * k + POSE], work,
-            moved[point],
+            frames[point], landmarks[point], by, poses[k], body_T_left, step[POSE * k : POSE * k + POSE],
+            _MAX_FARTHER, work, moved[point],
         ):  # fmt: skip
             frames[point] = se3_compose(moved_poses[k], body_T_left)
         else:

@@ -21,7 +21,7 @@ _MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe:
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
 _MAX_IMU_GAP_NS = 50_000_000
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
-_HELD_NS = 30_000_000  # by which time offsets of rig files may be wrong
+_HELD_NS = 30_000_000  # a time offset that is wrong by more is found over later windows
 _HELD_NOISE_FACTOR = 100.0  # on the variance of a reading that is held
 _KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
 

@@ -15,8 +15,9 @@ _MAX_NEARER = 0.5  # step of an inverse depth, relative, that is taken as one of
 
 @kernel
 def moved_with_camera(
-    frame: Float, landmark: Float, by: Float, pose: Float, body_T_cam: Float, step: Float, work: Float, moved: Float
-) -> bool:
+    frame: Float, landmark: Float, by: Float, pose: Float, body_T_cam: Float, step: Float, max_farther: float,
+    work: Float, moved: Float,
+) -> bool:  # fmt: skip
     """Fill in the landmark (3,), in the frame of the camera, after its own step (3,) and that of the body (6,).
 
     Args:
@@ -26,6 +27,8 @@ def moved_with_camera(
         pose: (4, 4) ``odom_T_body`` before.
         body_T_cam: (4, 4).
         step: (6,) of the pose.
+        max_farther: step to a smaller inverse depth, relative, up to which it is taken as one of the depth: with steps
+            of the depth any change of the scale is found, and with others points are found that are nearly infinite.
         work: (3, 3) for intermediate results.
         moved: (3,) output.
 
@@ -61,7 +64,7 @@ def moved_with_camera(
     moved[0] = at_x + (cam[0] - at_x * cam[2]) / depth
     moved[1] = at_y + (cam[1] - at_y * cam[2]) / depth
     nearer = (by[2] - at_w * cam[2]) / depth
-    if at_w > 0.0 and nearer < _MAX_NEARER * at_w:
+    if at_w > 0.0 and -max_farther * at_w < nearer < _MAX_NEARER * at_w:
         moved[2] = at_w / (1.0 - nearer / at_w)  # a step of the depth
     else:
         moved[2] = at_w + nearer

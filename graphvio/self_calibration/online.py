@@ -117,6 +117,7 @@ class SelfCalibration:
         self._sigma_px = FIRST_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
+        self._confirming = 0  # full windows that are used
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
@@ -222,6 +223,7 @@ class SelfCalibration:
             return False  # what a full window has confirmed, a part of one does not refute: it may be the scene's fault
         if is_full:
             self._evidence, self.has_full_window, self._refused = evidence, True, 0
+            self._confirming += 1
         if (
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
@@ -249,7 +251,7 @@ class SelfCalibration:
     @property
     def is_confirmed(self) -> bool:
         """Whether what is known comes from two full windows at least, which share no observation."""
-        return self.has_full_window and self._full_windows >= _MIN_CONFIRMING
+        return self.has_full_window and self._confirming >= _MIN_CONFIRMING
 
     @property
     def _pace(self) -> _Pace:
@@ -273,7 +275,7 @@ class SelfCalibration:
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
-        self.has_full_window, self._agreeing, self._refused = False, 0, 0
+        self.has_full_window, self._agreeing, self._refused, self._confirming = False, 0, 0, 0
         self.restarts += 1
         self._consider.forget()
 
@@ -314,7 +316,7 @@ class SelfCalibration:
         await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
         evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
-        if not np.array_equal(_assumed(factors), assumed):
+        if solution.has_converged and not np.array_equal(_assumed(factors), assumed):
             # What the window says was linearised where another file led it.
             prior = self._evidence.given(self._prior, _assumed(factors))
             solution = adjusted(window, samples, self._nominal, solution.calibration.mean, prior, self._sigma_px)

@@ -25,6 +25,7 @@ _LOOSE_SCALE_SIGMA = 5.0  # of distances and velocities: where all points are fa
 _FIXED = 1e-9
 _FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
 _MAX_LAST_DAMPING = 1e-5  # a step that more damping makes small does not say that this is the minimum
+_MAX_DAMPING = 1e2
 _ROUNDING = 1e-9  # of the cost, relative
 _GRAVITY_NORM_SIGMA = 5e-3
 
@@ -68,7 +69,8 @@ class Solution(NamedTuple):
         errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
         imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
         hessian: of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
-        has_converged: whether the last step hardly changed the calibration; else it is no minimum, and says nothing.
+        has_converged: whether the last step, with next to no damping, hardly changed the calibration; else it is no
+            minimum, and says nothing.
     """
 
     states: States
@@ -128,12 +130,13 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         damping = max(0.1 * damping, _MIN_DAMPING)
         new = _linearise(following, moved, first, nominal, changed, prior, damping, found)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
-        has_converged = bool(is_small and new.cost <= (1.0 + _ROUNDING) * at.cost and not loses_intervals)
-        if new.cost <= at.cost and not loses_intervals:
+        cost = new.cost - 0.5 * float(np.nansum(new.imu_errors2[np.isnan(at.imu_errors2)]))  # of what both cover
+        has_converged = bool(is_small and cost <= (1.0 + _ROUNDING) * at.cost and not loses_intervals)
+        if cost <= at.cost and not loses_intervals:
             window, states, difference, at, damping_at = following, moved, changed, new, damping
         else:
             found, damping = kept, max(100.0 * damping, 1e-4)
-        if has_converged:
+        if has_converged or damping > _MAX_DAMPING:
             break
     if damping_at > _MIN_DAMPING:  # damped landmarks hold the cameras, as if their attitude in body were known
         found = Eliminated.empty(window.tracks)
@@ -175,7 +178,9 @@ def _linearise(
     offsets[:, 3:] = states.poses[:, :3, 3] - first.poses[:, :3, 3]
     poses = np.arange(6 * n)
     hessian[poses, poses] += weights
-    gradient[poses[6:]] += (weights * offsets.ravel())[6:]
+    in_body = np.zeros((n, 6))
+    in_body[:, 3:] = np.einsum("kji,kj->ki", states.poses[:, :3, :3], offsets[:, 3:])
+    gradient[poses[6:]] += (weights * in_body.ravel())[6:]
     cost += 0.5 * float(weights[6:] @ offsets.ravel()[6:] ** 2)
     imu_errors2 = np.zeros(0)
     if window.samples is not None:

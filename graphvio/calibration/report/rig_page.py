@@ -41,7 +41,9 @@ def doubts_of(found: RecordedCalibration) -> list[str]:
         if hidden:
             doubts.append(f"hardly better known than by the file: {'; '.join(hidden)} (to show it, {motion})")
     if count := sum(found.batch.left_out):
-        doubts.append(f"{count} of {len(found.batch.left_out)} windows contradict the others and are left out")
+        doubts.append(
+            f"{count} of {len(found.batch.left_out)} windows contradict the others, or fit no calibration: left out"
+        )
     if found.halves is None:
         doubts.append("the recording is too short to be divided in halves, of which one would check the other")
     return doubts
