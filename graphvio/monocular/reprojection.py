@@ -9,6 +9,7 @@ from graphvio.cameras import N_ESTIMATED, distort, distortion_basis
 from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel
 from graphvio.rig import Rig
+from graphvio.self_calibration.observation import MIN_DEPTH_RATIO
 from graphvio.self_calibration.parameters import CAMERA, INTRINSICS, PLACE, SINGLE
 
 POSE = 6
@@ -19,8 +20,6 @@ POSE_AT = ERROR_AT + 1
 OF_STATE = 24
 POINT_AT = OF_STATE
 COLUMNS = POINT_AT + 3
-
-MIN_DEPTH_RATIO = 1e-3
 
 
 class Cameras(NamedTuple):

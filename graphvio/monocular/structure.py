@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.geometry import se3_compose
 from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import (
     COLUMNS,
@@ -22,7 +21,7 @@ from graphvio.monocular.reprojection import (
     whiten_view,
 )
 from graphvio.self_calibration.bundle import inverse3, rows_of
-from graphvio.self_calibration.moving_landmarks import moved_with_camera
+from graphvio.self_calibration.moving_landmarks import move_landmark
 from graphvio.self_calibration.parameters import CAMERA
 
 PRIOR_INVERSE_DEPTH = 0.2
@@ -85,10 +84,7 @@ def landmarks_after(
 ) -> tuple[Float, Float]:  # fmt: skip
     """Return the landmarks (L, 3) after a step of the poses and cameras, and their frames (L, 4, 4).
 
-    A landmark moves along with the camera that sees it first, which becomes its frame, and the step changes its
-    direction and distance there. So all distances and baselines may become larger by the same factor, and no view
-    changes: for a landmark that stays in a fixed frame, views are off by the square of the step, and the scale is found
-    in steps of a few percent.
+    A landmark moves along with the camera that sees it first, see `graphvio.self_calibration.moving_landmarks`.
 
     Args:
         landmarks: (L, 3) before.
@@ -100,8 +96,8 @@ def landmarks_after(
         step: (6 K + n,) of the poses and of n parameters of cameras.
     """
     n_poses = POSE * len(poses)
-    moved, frames, b, by = np.empty_like(landmarks), structure.odom_T_landmark.copy(), np.zeros(3), np.zeros(3)
-    work = np.zeros((3, 3))
+    moved, frames = np.empty_like(landmarks), structure.odom_T_landmark.copy()
+    b, work = np.zeros(3), np.zeros((4, 3))
     for point in range(len(landmarks)):
         for r in range(3):
             b[r] = eliminated.gradient[point, r]
@@ -110,20 +106,12 @@ def landmarks_after(
                     b[r] += eliminated.by_pose[n, r, c] * step[POSE * structure.state[n] + c]
             for c in range(eliminated.by_cameras.shape[2]):
                 b[r] += eliminated.by_cameras[point, r, c] * step[n_poses + c]
-        for r in range(3):
-            by[r] = 0.0
-            for c in range(3):
-                by[r] -= eliminated.inverse[point, r, c] * b[c]
         first = structure.rows[point]
         k, body_T_cam = structure.state[first], cameras.body_T_cam[structure.camera[first]]
-        if moved_with_camera(
-            frames[point], landmarks[point], by, poses[k], body_T_cam, step[POSE * k : POSE * k + POSE],
-            np.inf, work, moved[point],
-        ):  # fmt: skip
-            frames[point] = se3_compose(moved_poses[k], body_T_cam)
-        else:
-            for r in range(3):
-                moved[point, r] = landmarks[point, r] + by[r]
+        move_landmark(
+            frames[point], landmarks[point], eliminated.inverse[point], b, poses[k], moved_poses[k], body_T_cam,
+            step[POSE * k : POSE * k + POSE], np.inf, work, moved[point],
+        )  # fmt: skip
     return moved, frames
 
 

@@ -12,14 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.geometry import se3_compose
 from graphvio.kernels import kernel, vector_kernel
-from graphvio.self_calibration.moving_landmarks import moved_with_camera
+from graphvio.self_calibration.moving_landmarks import move_landmark
 from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, POINT, POINT_AT, POSE, new_scratch, observe
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
 _ERROR2_BEHIND = 1e6  # of a landmark behind the camera
-_MAX_FARTHER = 0.5  # see `moved_with_camera`: stereo cameras see points that are nearly infinite
+_MAX_FARTHER = 0.5  # see `move_landmark`: stereo cameras see points that are nearly infinite
 
 
 class Tracks(NamedTuple):
@@ -297,6 +296,8 @@ def landmarks_after(
 ) -> tuple[Float, Float]:  # fmt: skip
     """Return the landmarks (L, 3) after a step of poses and calibration, and their frames (L, 4, 4).
 
+    A landmark moves along with the camera that sees it first, see `graphvio.self_calibration.moving_landmarks`.
+
     Args:
         landmarks: (L, 3) before.
         tracks: of these.
@@ -307,7 +308,7 @@ def landmarks_after(
         step: (6 K + P PAIR,) of poses and calibration.
     """
     moved, frames = np.empty_like(landmarks), tracks.odom_T_landmark.copy()
-    b, by, work = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    b, work = np.zeros(3), np.zeros((4, 3))
     for point in range(len(landmarks)):
         first, end, at = tracks.rows[point], tracks.rows[point + 1], POSE * len(poses) + PAIR * tracks.pair[point]
         for r in range(3):
@@ -318,17 +319,9 @@ def landmarks_after(
                 k = POSE * tracks.keyframe[n]
                 for c in range(POSE):
                     b[r] += eliminated.by_pose[n, r, c] * step[k + c]
-        for r in range(3):
-            by[r] = 0.0
-            for c in range(3):
-                by[r] -= eliminated.inverse[point, r, c] * b[c]
         k, body_T_left = tracks.keyframe[first], calibration.body_T_left[tracks.pair[point]]
-        if moved_with_camera(
-            frames[point], landmarks[point], by, poses[k], body_T_left, step[POSE * k : POSE * k + POSE],
-            _MAX_FARTHER, work, moved[point],
-        ):  # fmt: skip
-            frames[point] = se3_compose(moved_poses[k], body_T_left)
-        else:
-            for r in range(3):
-                moved[point, r] = landmarks[point, r] + by[r]
+        move_landmark(
+            frames[point], landmarks[point], eliminated.inverse[point], b, poses[k], moved_poses[k], body_T_left,
+            step[POSE * k : POSE * k + POSE], _MAX_FARTHER, work, moved[point],
+        )  # fmt: skip
     return moved, frames

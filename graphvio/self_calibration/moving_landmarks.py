@@ -7,14 +7,48 @@ and the scale is found in steps of a few percent.
 """
 
 from graphvio.arrays import Float
-from graphvio.kernels import kernel
+from graphvio.geometry import se3_compose
+from graphvio.kernels import kernel, put
+from graphvio.self_calibration.observation import MIN_DEPTH_RATIO
 
-_MIN_DEPTH_RATIO = 1e-3
 _MAX_NEARER = 0.5  # step of an inverse depth, relative, that is taken as one of the depth
 
 
 @kernel
-def moved_with_camera(
+def move_landmark(
+    frame: Float, landmark: Float, inverse: Float, gradient: Float, pose: Float, moved_pose: Float, body_T_cam: Float,
+    step: Float, max_farther: float, work: Float, moved: Float,
+) -> None:  # fmt: skip
+    """Fill in a landmark (3,) after a step, and its frame: the camera's, or as it was where it is behind the camera.
+
+    Args:
+        frame: (4, 4) of the landmark in odom; output too.
+        landmark: (3,) before.
+        inverse: (3, 3) of its normal matrix.
+        gradient: (3,) of the cost by it after the step of the others.
+        pose: (4, 4) ``odom_T_body`` before, of the state that sees it first.
+        moved_pose: (4, 4) after.
+        body_T_cam: (4, 4) of the camera that sees it first.
+        step: (6,) of the pose.
+        max_farther: step to a smaller inverse depth, relative, up to which it is taken as one of the depth: with steps
+            of the depth any change of the scale is found, and with others points are found that are nearly infinite.
+        work: (4, 3) for intermediate results.
+        moved: (3,) output.
+    """
+    by = work[3]
+    for r in range(3):
+        by[r] = 0.0
+        for c in range(3):
+            by[r] -= inverse[r, c] * gradient[c]
+    if _moved_with_camera(frame, landmark, by, pose, body_T_cam, step, max_farther, work, moved):
+        put(frame, se3_compose(moved_pose, body_T_cam))
+    else:
+        for r in range(3):
+            moved[r] = landmark[r] + by[r]
+
+
+@kernel
+def _moved_with_camera(
     frame: Float, landmark: Float, by: Float, pose: Float, body_T_cam: Float, step: Float, max_farther: float,
     work: Float, moved: Float,
 ) -> bool:  # fmt: skip
@@ -27,9 +61,8 @@ def moved_with_camera(
         pose: (4, 4) ``odom_T_body`` before.
         body_T_cam: (4, 4).
         step: (6,) of the pose.
-        max_farther: step to a smaller inverse depth, relative, up to which it is taken as one of the depth: with steps
-            of the depth any change of the scale is found, and with others points are found that are nearly infinite.
-        work: (3, 3) for intermediate results.
+        max_farther: as `move_landmark`.
+        work: (4, 3) for intermediate results, of which three rows are used.
         moved: (3,) output.
 
     Returns:
@@ -46,7 +79,7 @@ def moved_with_camera(
         cam[r] = 0.0
         for c in range(3):
             cam[r] += body_T_cam[c, r] * (body[c] - w * body_T_cam[c, 3])
-    if not cam[2] > _MIN_DEPTH_RATIO:
+    if not cam[2] > MIN_DEPTH_RATIO:
         return False
     at_x, at_y, depth, at_w = cam[0] / cam[2], cam[1] / cam[2], cam[2], w / cam[2]
     # How that changes, in first order: by its own step, and as the body turns and shifts.

@@ -26,7 +26,7 @@ POSE, POINT = 6, 3
 POINT_AT = POSE + PAIR
 ERROR_AT = POINT_AT + POINT
 COLUMNS = ERROR_AT + 1
-_MIN_DEPTH_RATIO = 1e-3
+MIN_DEPTH_RATIO = 1e-3
 
 
 class Scratch(NamedTuple):
@@ -53,7 +53,7 @@ def _project(
     by_camera: Float,
 ) -> bool:  # fmt: skip
     """Project a homogeneous point (3,): the error (2,), its derivatives by the point (2, 3) and the camera (2, 9)."""
-    if not y[2] > _MIN_DEPTH_RATIO:
+    if not y[2] > MIN_DEPTH_RATIO:
         return False
     model, intrinsics, distortion = (
         calibration.models[j, image], calibration.intrinsics[j, image], calibration.distortion[j, image],

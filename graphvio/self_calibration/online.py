@@ -88,7 +88,6 @@ class SelfCalibration:
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         widest: (C, C) covariance of what is known, if the file may be as wrong as any.
-        has_full_window: whether it is based on a full window at least.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
     """
@@ -107,7 +106,6 @@ class SelfCalibration:
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.extrinsics: dict[int, Float] = {}
         self.widest = widest
-        self.has_full_window = False
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
         self._in_force = self._nominal
@@ -117,7 +115,7 @@ class SelfCalibration:
         self._sigma_px = FIRST_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
-        self._confirming = 0  # full windows that are used
+        self._used_windows = 0  # full ones, without those that are left out
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
@@ -222,8 +220,8 @@ class SelfCalibration:
         if self.has_full_window and was_exact and not (is_full or adjusted.estimate.is_file_exact):
             return False  # what a full window has confirmed, a part of one does not refute: it may be the scene's fault
         if is_full:
-            self._evidence, self.has_full_window, self._refused = evidence, True, 0
-            self._confirming += 1
+            self._evidence, self._refused = evidence, 0
+            self._used_windows += 1
         if (
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
@@ -249,9 +247,14 @@ class SelfCalibration:
         return n_of_cameras(self._rig)
 
     @property
+    def has_full_window(self) -> bool:
+        """Whether what is known is based on a full window at least."""
+        return self._used_windows > 0
+
+    @property
     def is_confirmed(self) -> bool:
         """Whether what is known comes from two full windows at least, which share no observation."""
-        return self.has_full_window and self._confirming >= _MIN_CONFIRMING
+        return self._used_windows >= _MIN_CONFIRMING
 
     @property
     def _pace(self) -> _Pace:
@@ -275,7 +278,7 @@ class SelfCalibration:
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
-        self.has_full_window, self._agreeing, self._refused, self._confirming = False, 0, 0, 0
+        self._used_windows, self._agreeing, self._refused = 0, 0, 0
         self.restarts += 1
         self._consider.forget()
 

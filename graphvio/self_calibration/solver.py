@@ -25,7 +25,7 @@ _LOOSE_SCALE_SIGMA = 5.0  # of distances and velocities: where all points are fa
 _FIXED = 1e-9
 _FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
 _MAX_LAST_DAMPING = 1e-5  # a step that more damping makes small does not say that this is the minimum
-_MAX_DAMPING = 1e2
+_MAX_DAMPING = 1e2  # beyond it steps change nothing
 _ROUNDING = 1e-9  # of the cost, relative
 _GRAVITY_NORM_SIGMA = 5e-3
 
@@ -175,12 +175,10 @@ def _linearise(
     weights = 1.0 / _loose_pose_sigmas(first.poses) ** 2
     weights[:6] = 1.0 / _FIXED**2
     offsets = np.zeros((n, 6))
-    offsets[:, 3:] = states.poses[:, :3, 3] - first.poses[:, :3, 3]
+    offsets[:, 3:] = np.einsum("kji,kj->ki", states.poses[:, :3, :3], states.poses[:, :3, 3] - first.poses[:, :3, 3])
     poses = np.arange(6 * n)
     hessian[poses, poses] += weights
-    in_body = np.zeros((n, 6))
-    in_body[:, 3:] = np.einsum("kji,kj->ki", states.poses[:, :3, :3], offsets[:, 3:])
-    gradient[poses[6:]] += (weights * in_body.ravel())[6:]
+    gradient[poses[6:]] += (weights * offsets.ravel())[6:]
     cost += 0.5 * float(weights[6:] @ offsets.ravel()[6:] ** 2)
     imu_errors2 = np.zeros(0)
     if window.samples is not None:
