@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 
 import cv2
@@ -10,8 +9,8 @@ import numpy as np
 
 from graphvio.arrays import Image
 from graphvio.measurements.events import EventKind
+from graphvio.png import SIGNATURE, DamagedPngError, decode_grey_png
 
-_PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 
@@ -55,9 +54,21 @@ def decode_grey(data: bytes, where: str) -> Image:
     Raises:
         ImageError: if it is truncated or damaged.
     """
-    damage = damage_of(data)
-    if damage:
-        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} {damage}")
+    if data.startswith(SIGNATURE):
+        try:
+            grey = decode_grey_png(data)
+        except DamagedPngError as error:
+            raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} {error}") from None
+        return grey if grey is not None else _decode_by_opencv(data, where)
+    if not data:
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is empty")
+    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:  # some writers pad
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is truncated")
+    return _decode_by_opencv(data, where)
+
+
+def _decode_by_opencv(data: bytes, where: str) -> Image:
+    """Decode any format of OpenCV, which fills missing parts with grey and reports success: check for these before."""
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -73,32 +84,3 @@ def decode_grey(data: bytes, where: str) -> Image:
         code = codes.get(image.shape[2])
         image = image[:, :, 0] if code is None else cv2.cvtColor(image, code)
     return np.ascontiguousarray(image, dtype=np.uint8)
-
-
-def damage_of(data: bytes) -> str | None:
-    """Describe damage of an image file, to follow its name in a message; None if none is found.
-
-    Decoders fill missing parts with grey and report success, so PNG chunks and the JPEG end marker are checked.
-    """
-    if not data:
-        return "is empty"
-    if data.startswith(_PNG):
-        return _png_damage(data)
-    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:  # some writers pad
-        return "is truncated"
-    return None
-
-
-def _png_damage(data: bytes) -> str | None:
-    view = memoryview(data)
-    at = len(_PNG)
-    while at + 12 <= len(data):
-        body_end = at + 8 + int.from_bytes(view[at : at + 4], "big")
-        if body_end + 4 > len(data):
-            return "is truncated"
-        if zlib.crc32(view[at + 4 : body_end]) != int.from_bytes(view[body_end : body_end + 4], "big"):
-            return "is damaged (checksum)"
-        if bytes(view[at + 4 : at + 8]) == b"IEND":
-            return None
-        at = body_end + 4
-    return "is truncated"

@@ -42,6 +42,7 @@ from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_el
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
 from graphvio.monocular.warm_up import adjust_no_keyframes
+from graphvio.png import undo_filters
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
 from graphvio.slam.landmarks import orientations
@@ -148,6 +149,7 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
         _track_singles(rig, config, rng)
     if any(camera.line_time_us for camera in rig.cameras):
         pixels_at_lines(pair.left, frame.pixels, frame.points[:, 2], ReadoutMotion.steady(np.eye(4), 1.0))
+    undo_filters(np.frombuffer(bytes(2), dtype=np.uint8).reshape(1, 2), 1, np.zeros((2, 1), dtype=np.uint8))
     common_rows(frame.ids, frame.ids)
     orientations(noise, np.full((1, 2), 20.0))
     pair.left.project(np.ones((1, 3)))

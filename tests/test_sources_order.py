@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recordings import noise_image, small_rig, write_image
 
-from graphvio.image_decoding import damage_of
+from graphvio.image_decoding import ImageError, decode_grey
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
@@ -157,11 +157,10 @@ def test_imu_csv_is_read_exactly(
         assert table.values[:, 0].tolist() == [i + 0.25 for i in range(len(stamps))]
 
 
-@given(st.binary(max_size=200))
-def test_damage_of_any_bytes_never_raises(data: bytes) -> None:
-    damage_of(data)
-    damage_of(b"\x89PNG\r\n\x1a\n" + data)
-    damage_of(b"\xff\xd8" + data)
+@given(st.binary(max_size=200), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"]))
+def test_decode_grey_of_any_bytes_raises_image_error(data: bytes, signature: bytes) -> None:
+    with pytest.raises(ImageError, match=r"image\.png"):
+        decode_grey(signature + data, "image.png")
 
 
 def test_recording_memory_does_not_grow_with_length(tmp_path: Path) -> None:
