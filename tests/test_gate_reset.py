@@ -1,4 +1,4 @@
-"""Reinitialisation from vision where the IMU turns out to have been corrected wrongly."""
+"""What the gate refuses without an IMU, and reinitialisation from vision where the IMU was corrected wrongly."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from graphvio import Config
 from graphvio.arrays import Float
 from graphvio.backend.smoother_estimator import SmootherEstimator
-from graphvio.geometry import se3_exp, se3_log
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
@@ -67,3 +67,38 @@ def test_prediction_that_is_not_distrusted_is_kept() -> None:
     assert EventKind.GATE_RESET not in kinds
     assert statuses[WRONG_UNTIL - 1] is Status.COASTING
     assert turned_rad(estimator.state().nav_T_body) == pytest.approx(0.3 * 0.25, rel=0.2)
+
+
+def turn_by_vision(angles_rad: Float) -> tuple[Float, list[EventKind]]:
+    """Turn about z as vision measures it, each motion from the frameset before, without an IMU.
+
+    Returns:
+        The motion (4, 4) from the first to the last state, and the events.
+    """
+    kinds, rig = list[EventKind](), default_rig().without_imu()
+    estimator = SmootherEstimator(rig, Config(), lambda _ns, kind, _detail: kinds.append(EventKind(kind)))
+    estimator.initialise(BASE_NS, None)
+    estimator.update(BASE_NS, True, frozenset())
+    first, reference_ns = estimator.state().nav_T_body, BASE_NS
+    for n, angle_rad in enumerate(np.diff(angles_rad), start=1):
+        stamp_ns = BASE_NS + n * STEP_NS
+        estimator.predict(stamp_ns, None)
+        measured = se3_exp(np.array([0.0, 0.0, angle_rad, 0.0, 0.0, 0.0]))
+        motion = RelativeMotion(reference_ns, stamp_ns, measured, np.diag(SIGMAS**2), np.zeros((6, 6)), 200)
+        estimator.apply(VisualResult(motion, Quality.GOOD, "", {}), is_stationary=False)
+        estimator.update(stamp_ns, True, frozenset([stamp_ns]))
+        reference_ns = stamp_ns
+    return se3_inverse(first) @ estimator.state().nav_T_body, kinds
+
+
+def test_gate_without_imu_accepts_fast_hand_held_turns() -> None:
+    times_s = np.arange(60) * STEP_NS * 1e-9
+    angles_rad = 0.4 * np.sin(2.0 * np.pi * 2.0 * times_s)  # up to 5 rad/s and 63 rad/s^2
+    turned, kinds = turn_by_vision(angles_rad)
+    assert kinds == []
+    assert se3_log(turned)[2] == pytest.approx(angles_rad[-1], abs=5.0 * SIGMAS[0] * np.sqrt(len(times_s)))
+
+
+def test_gate_without_imu_refuses_a_leap() -> None:
+    _, kinds = turn_by_vision(np.array([0.0] * 20 + [0.7]))
+    assert kinds == [EventKind.VISION_GATED]

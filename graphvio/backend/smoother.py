@@ -181,8 +181,13 @@ class Smoother:
         relative = se3_inverse(self.pose(stamp_ns)) @ self.pose(self.latest_ns)
         return relative_covariance(relative, self._window.joint_covariance([x(i), x(j)]))
 
-    def gate(self, motion: RelativeMotion) -> GateResult:
-        """Test the innovation of a motion that ends in the newest state against the window's prediction."""
+    def gate(self, motion: RelativeMotion, sigma_scale: float = 1.0) -> GateResult:
+        """Test the innovation of a motion that ends in the newest state against the window's prediction.
+
+        Args:
+            motion: By vision.
+            sigma_scale: Factor on the standard deviations of the prediction.
+        """
         newest = x(self._index_of[motion.stamp_ns])
         reference, covariance = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
         if motion.calibration_covariance is not None:
@@ -193,7 +198,7 @@ class Smoother:
             motion.reference_T_current,
             covariance,
             predicted,
-            relative_covariance(predicted, self._window.joint_covariance([reference, newest])),
+            sigma_scale**2 * relative_covariance(predicted, self._window.joint_covariance([reference, newest])),
             self._config.gate_probability,
         )
 

@@ -36,6 +36,8 @@ from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion,
 from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
+# Of the prediction's sigmas, for the gate without an IMU: fast hand-held cameras often leave constant velocity.
+_CONSTANT_VELOCITY_SCALE = 3.0
 
 
 class SmootherEstimator:
@@ -247,6 +249,8 @@ class SmootherEstimator:
             self._reinitialise_after_lost(motion)
             return MeasurementUpdate(motion, needs_keyframe=True)
         motion, gate_result = self._contradiction.resolve(visual, self._running.gate, self.has_imu)
+        if not gate_result.accepted and not self.has_imu:
+            gate_result = smoother.gate(motion, _CONSTANT_VELOCITY_SCALE)
         self.gate_results["vision"] = gate_result
         excess = smoother.excess_acceleration(motion)
         if gate_result.accepted and excess is None:

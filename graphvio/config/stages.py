@@ -138,7 +138,8 @@ class SmootherConfig(Stage):
     """Age from which a state may leave the window, unless later motions are measured from it: when the window is next
     solved as a whole, up to two framesets later."""
     gate_probability: float = 0.9999
-    """Vision is rejected where its innovation lies outside this share of the chi-square distribution."""
+    """Vision is rejected where its innovation lies outside this share of the chi-square distribution. Without an IMU,
+    the sigmas of the prediction are three times as large for it: constant velocity is no measurement."""
     huber_probability: float = 1.0
     """Motions that passed the gate are down-weighted by Huber's kernel where the solution leaves them outside this
     share of the chi-square distribution; 1 weighs all by their covariance. Below 1 the window is solved twice."""
