@@ -19,14 +19,19 @@ if TYPE_CHECKING:
 def simulate(
     name: Annotated[
         str,
-        typer.Argument(help="Scene: room, corridor, stairs, loop or calibration.", autocompletion=completion.scene),
+        typer.Argument(
+            help="Scene: room, corridor, stairs, loop, calibration, street or flight.", autocompletion=completion.scene
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder to write; new or empty.")],
     duration: Annotated[
         float | None, typer.Option("--duration", help="Seconds of the walk.  [default: all of it]")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of all noise: same seed, same bytes.")] = 0,
-    rate: Annotated[float, typer.Option("--rate", help="Framesets per second.")] = 20.0,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", help="Framesets per second.  [default: 20, and 10 in the street]"),
+    ] = None,
     trigger_offset_ms: Annotated[
         float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the previous one.")
     ] = 0.0,
@@ -64,22 +69,24 @@ def simulate(
         ),
     ] = None,
     rig: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--rig",
-            help="Rig file; or paper, two stereo pairs, stereo, stereo+back, headset, surround or phone.",
+            help="Rig file; or paper, two stereo pairs, stereo, stereo+back, headset, surround, phone, car or drone.  "
+            "[default: the scene's own: car in the street, drone in flight, else paper]",
             metavar="RIG",
             autocompletion=completion.named_rig,
         ),
-    ] = "paper",
+    ] = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
+    """Simulate a walk, drive or flight with cameras and an IMU, and write it in the EuRoC/ASL layout.
 
     With a calibration error the true rig is in rig-true.yaml next to rig.yaml; images are the same.
 
     The corridor has a door that opens in front, a crowd, a bend with blank walls and failing lamps. The loop goes once
-    around four corridors, passes its first position again, turns round and comes back past it.
+    around four corridors, passes its first position again, turns round and comes back past it. The street is driven by
+    car, with a stereo pair; the flight is a drone's, 50 m over fields, and begins in the air.
 
     Examples:
 
@@ -90,6 +97,8 @@ def simulate(
         graphvio simulate room --out room --calibration-error 2
 
         graphvio simulate room --out room --rig stereo+back
+
+        graphvio simulate street --out street
     """
     from graphvio.simulation import CalibrationError
     from graphvio.simulation import simulate as simulate_recording
@@ -100,8 +109,10 @@ def simulate(
         error = CalibrationError.of_level(calibration_error, calibration_component)
     elif calibration_component or calibration_seed is not None:
         raise typer.BadParameter("--calibration-component and --calibration-seed need --calibration-error LEVEL")
-    true_rig = rig_of(rig)
-    _check_names(true_rig, rig)
+    true_rig = None
+    if rig is not None:
+        true_rig = rig_of(rig)
+        _check_names(true_rig, rig)
     try:
         with framesets_bar() as bar:
             task = bar.add_task(f"rendering {name}", total=None)

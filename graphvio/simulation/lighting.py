@@ -32,7 +32,7 @@ def light_map(rectangles: list[Rectangle], lamps: list[Lamp], ambient: float) ->
     even: list[tuple[int, int, float]] = []
     end = 0
     for i, r in enumerate(rectangles):
-        columns, rows = (1, 1) if r.lit_evenly else (_cells(r.edge_u), _cells(r.edge_v))
+        columns, rows = (1, 1) if r.lit_evenly or not lamps else (_cells(r.edge_u), _cells(r.edge_v))
         # Not quite to the edge, where the point would lie inside the neighbouring wall.
         u, v = np.meshgrid(np.linspace(0.01, 0.99, columns), np.linspace(0.01, 0.99, rows))
         points.append(r.origin + u.reshape(-1, 1) * r.edge_u + v.reshape(-1, 1) * r.edge_v)

@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 
 KNOT_S = 0.05
-_STEP_S = 0.01
+STEP_S = 0.01
 _CORNER_S = 1.5  # over which a corner of the path is rounded
 _HEADING_S = 2.2  # over which the body turns at a corner
 
@@ -152,7 +152,7 @@ class Walk:
         start_s = stationary_s + 0.5 * max(_CORNER_S, _HEADING_S) if stationary_s > 0.0 else -2.0
         # The whole path, even if a part is wanted: a shorter recording is the beginning of the whole one.
         end_s = max(duration_s, start_s + self._corner_at[-1] / speed_mps)
-        self._times = np.arange(-2.0, end_s + 3.0, _STEP_S)
+        self._times = np.arange(-2.0, end_s + 3.0, STEP_S)
         walked = np.clip(speed_mps * (self._times - start_s), 0.0, None)
         self._walked = np.minimum(walked, self._corner_at[-1])
         self.motion = Motion(self._course, duration_s)
@@ -166,9 +166,9 @@ class Walk:
         steps = np.diff(self.path[:, :2], axis=0)
         headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
         leg = np.clip(np.searchsorted(self._corner_at, self._walked, side="right") - 1, 0, len(headings) - 1)
-        position = np.column_stack([_smoothed(along[:, i], _CORNER_S) for i in range(3)])
-        yaw = _smoothed(headings[leg], _HEADING_S)
-        pace = _smoothed(np.gradient(self._walked, _STEP_S), _CORNER_S)
+        position = np.column_stack([smoothed(along[:, i], _CORNER_S) for i in range(3)])
+        yaw = smoothed(headings[leg], _HEADING_S)
+        pace = smoothed(np.gradient(self._walked, STEP_S), _CORNER_S)
         stride = pace / max(float(pace.max()), 1e-9)  # no bob at standstill
         gait, t = self.gait, self._times
         step, side = 2.0 * np.pi * gait.steps_hz * t, np.pi * gait.steps_hz * t
@@ -186,9 +186,9 @@ class Walk:
         return np.column_stack([np.interp(times, t, course[:, i]) for i in range(6)])
 
 
-def _smoothed(values: Float, window_s: float) -> Float:
+def smoothed(values: Float, window_s: float) -> Float:
     """Smooth values (N,) by a raised cosine of the given full width."""
-    half = round(0.5 * window_s / _STEP_S)
+    half = round(0.5 * window_s / STEP_S)
     window = np.hanning(2 * half + 3)[1:-1]
     padded = np.pad(values, half, mode="edge")
     return np.convolve(padded, window / window.sum(), mode="valid")

@@ -67,6 +67,22 @@ def phone() -> Rig:
     return Rig((), Imu(), "phone", singles=(SingleCamera(camera),))
 
 
+def car() -> Rig:
+    """Return a stereo pair of 1241x376 pixels with a baseline of 0.537 m, as of KITTI's cars, in front of the body."""
+    intrinsics = np.array([718.856, 718.856, 607.1928, 185.2157])
+    lens = ("radial-tangential", (1241, 376), intrinsics, np.zeros(4))
+    cameras = (Camera(f"cam{k}", *lens, _body_T_cam((1.0, 0.27 - 0.537 * k, 0.0), 0.0, 0.0)) for k in range(2))
+    return Rig((StereoPair("front", *cameras),), Imu(), "car")
+
+
+def drone() -> Rig:
+    """Return a stereo pair of 752x480 pixels with a baseline of 0.11 m, which looks 45 degrees down."""
+    intrinsics, distortion = np.array([460.0, 459.1, 382.8, 244.6]), np.array([-0.28, 0.07, 2e-4, 1e-5])
+    lens = ("radial-tangential", (752, 480), intrinsics, distortion)
+    cameras = (Camera(f"cam{k}", *lens, _body_T_cam((0.1, 0.055 - 0.11 * k, 0.0), 0.0, 45.0)) for k in range(2))
+    return Rig((StereoPair("front", *cameras),), Imu(), "drone")
+
+
 def _body_T_cam(position_m: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> Float:
     """Return the pose of a camera that looks to the left of forward by a yaw, and down by a pitch."""
     yaw, pitch = np.deg2rad(yaw_deg), np.deg2rad(pitch_deg)
@@ -82,8 +98,10 @@ NAMED_RIGS: dict[str, Callable[[], Rig]] = {
     "headset": headset,
     "surround": surround,
     "phone": phone,
+    "car": car,
+    "drone": drone,
 }
-"""Rigs by name; ``paper`` is the default."""
+"""Rigs by name; ``paper`` is that of most scenes."""
 
 
 def rig_of(name: str) -> Rig:

@@ -22,9 +22,10 @@ from graphvio.rig_files import save_rig
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.simulation.calibration_error import CalibrationError, draw
-from graphvio.simulation.default_rig import default_rig
+from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.simulation.rig_change import RIG_CHANGES
-from graphvio.simulation.simulator import Simulator, make_simulator
+from graphvio.simulation.scenes import build_scene
+from graphvio.simulation.simulator import Simulator
 
 TRUE_RIG_FILE = "rig-true.yaml"
 
@@ -63,7 +64,7 @@ def simulate(
     *,
     duration_s: float | None = None,
     seed: int = 0,
-    rate_hz: float | Sequence[float] = 20.0,
+    rate_hz: float | Sequence[float] | None = None,
     stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
     calibration_error: CalibrationError | None = None,
@@ -79,7 +80,8 @@ def simulate(
         out: folder to write; it must be empty or not exist.
         duration_s: of the recording; None for the whole walk.
         seed: of all noise; the same seed gives the same bytes.
-        rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it.
+        rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it;
+            None for the scene's own rate.
         stationary_s: initial standstill; 0 begins at walking speed.
         trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
         calibration_error: of the files that describe the cameras, and of the IMU's data; images are the same. None for
@@ -87,7 +89,7 @@ def simulate(
         calibration_seed: by which the error is sampled; None for ``seed``.
         rig_change: one of `graphvio.simulation.RIG_CHANGES`, of the true cameras during the walk, which the files know
             nothing of; None if they stay as they are.
-        rig: true cameras and IMU; None for the default rig.
+        rig: true cameras and IMU; None for the scene's own rig.
         progress: called as the framesets are written.
 
     Raises:
@@ -97,21 +99,20 @@ def simulate(
     _require_empty(out)
     if rig_change is not None and rig_change not in RIG_CHANGES:
         raise SourceError(f"there is no change {rig_change!r} of the rig; choose from {', '.join(RIG_CHANGES)}")
+    scene = build_scene(name, duration_s, stationary_s)
     sampled = None
     if calibration_error is not None:
         sampled = draw(
-            rig if rig is not None else default_rig(),
+            rig if rig is not None else NAMED_RIGS[scene.rig](),
             calibration_error,
             seed if calibration_seed is None else calibration_seed,
         )
-    simulator = make_simulator(
-        name,
-        duration_s=duration_s,
-        seed=seed,
-        rate_hz=rate_hz,
-        stationary_s=stationary_s,
+    simulator = Simulator(
+        scene,
+        sampled.true_rig if sampled is not None else rig,
+        seed,
+        rate_hz,
         trigger_offset_ms=trigger_offset_ms,
-        rig=sampled.true_rig if sampled is not None else rig,
         imu_error=sampled.imu if sampled is not None else None,
         rig_change=RIG_CHANGES[rig_change] if rig_change is not None else None,
     )

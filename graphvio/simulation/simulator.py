@@ -12,8 +12,8 @@ from graphvio.errors import SourceError
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Imu, Rig
 from graphvio.simulation.calibration_error import ImuError
-from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.imu import ImuTrack, measure
+from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.simulation.renderer import CameraRays, Film, View
 from graphvio.simulation.rig_change import RigChange
 from graphvio.simulation.scenes import build_scene
@@ -31,9 +31,10 @@ class Simulator:
 
     Args:
         scene: world, motion and light.
-        rig: true cameras and IMU; None for the default rig. A rig without an IMU is given the default IMU.
+        rig: true cameras and IMU; None for the scene's own rig. A rig without an IMU is given the default IMU.
         seed: of all noise and biases. World and walk do not depend on it.
-        rate_hz: framesets per second; or one rate for each pair and single camera, the last one also for all after it.
+        rate_hz: framesets per second; or one rate for each pair and single camera, the last one also for all after it;
+            None for the scene's own rate.
         atlas: textures of the world; None for the standard textures.
         trigger_offset_ms: delay of each pair's triggers after those of the pair before it; likewise of single cameras.
         imu_error: scale and misalignment of the IMU; None for none.
@@ -51,13 +52,14 @@ class Simulator:
         scene: Scene,
         rig: Rig | None = None,
         seed: int = 0,
-        rate_hz: float | Sequence[float] = 20.0,
+        rate_hz: float | Sequence[float] | None = None,
         atlas: Atlas | None = None,
         trigger_offset_ms: float = 0.0,
         imu_error: ImuError | None = None,
         rig_change: RigChange | None = None,
     ) -> None:
-        rates = list(rate_hz) if isinstance(rate_hz, Sequence) else [rate_hz]
+        wanted = rate_hz if rate_hz is not None else scene.rate_hz
+        rates = list(wanted) if isinstance(wanted, Sequence) else [wanted]
         for rate in rates:
             if not 0.1 <= rate <= 200.0:
                 raise SourceError(f"a rate of {rate} Hz cannot be simulated; give 0.1 to 200 framesets per second")
@@ -68,7 +70,7 @@ class Simulator:
         if seed < 0:
             raise SourceError(f"the seed {seed} is negative; give 0 or more")
         self.scene = scene
-        self.rig = rig if rig is not None else default_rig()
+        self.rig = rig if rig is not None else NAMED_RIGS[scene.rig]()
         self.imu = self.rig.imu if self.rig.imu is not None else Imu()
         self.seed = seed
         groups = len(self.rig.groups)
@@ -184,7 +186,7 @@ def make_simulator(
     *,
     duration_s: float | None = None,
     seed: int = 0,
-    rate_hz: float | Sequence[float] = 20.0,
+    rate_hz: float | Sequence[float] | None = None,
     stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
     rig: Rig | None = None,

@@ -12,15 +12,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from graphvio.arrays import Float, Int
+from graphvio.simulation.noise import SIDE, Map, Rng, noise
+from graphvio.simulation.outdoor_textures import OUTDOOR_PAINTERS
 
-SIDE = 512
 _WORLD_SEED = 20070613
-
-Rng = np.random.Generator
-Map = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,33 +79,19 @@ def checkerboard(squares: int) -> Map:
     return np.where((row[:, None] + row[None, :]) % 2 == 0, 0.12, 0.85).astype(np.float32)
 
 
-def _noise(rng: Rng, coarsest: int, octaves: int, gain: float = 0.6) -> Map:
-    """Sample seamless noise (SIDE, SIDE) of unit deviation; ``coarsest`` cells a side, each octave twice as fine."""
-    total = np.zeros((SIDE, SIDE), dtype=np.float32)
-    amplitude, cells = 1.0, coarsest
-    for _ in range(octaves):
-        lattice = np.pad(rng.standard_normal((cells, cells)).astype(np.float32), 2, mode="wrap")
-        scale = SIDE // cells
-        wide = cv2.resize(lattice, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        total += amplitude * wide[2 * scale : 2 * scale + SIDE, 2 * scale : 2 * scale + SIDE]
-        amplitude *= gain
-        cells = min(2 * cells, SIDE)
-    return np.asarray(total / total.std(), dtype=np.float32)
-
-
 def _plaster(rng: Rng) -> Map:
-    stains = _noise(rng, 4, 6, 0.7)
-    scratches = (_noise(rng, 64, 3) > 2.0) * 0.22
+    stains = noise(rng, 4, 6, 0.7)
+    scratches = (noise(rng, 64, 3) > 2.0) * 0.22
     return np.asarray(0.58 + 0.055 * stains - scratches, dtype=np.float32)
 
 
 def _blank(rng: Rng) -> Map:
-    return np.asarray(0.62 + 0.0008 * _noise(rng, 8, 5), dtype=np.float32)
+    return np.asarray(0.62 + 0.0008 * noise(rng, 8, 5), dtype=np.float32)
 
 
 def _concrete(rng: Rng) -> Map:
-    base = 0.42 + 0.07 * _noise(rng, 4, 7, 0.8)
-    base[(_noise(rng, 64, 2) > 1.9)] -= 0.2
+    base = 0.42 + 0.07 * noise(rng, 4, 7, 0.8)
+    base[(noise(rng, 64, 2) > 1.9)] -= 0.2
     base[:3] -= 0.15
     base[:, :3] -= 0.15
     return base
@@ -128,36 +111,36 @@ def _cells(rng: Rng, rows: int, columns: int, joint: int, shift: bool, spread: f
 
 def _brick(rng: Rng) -> Map:
     fields, joints = _cells(rng, 16, 8, 5, shift=True, spread=0.09)
-    return np.asarray((0.33 + fields + 0.05 * _noise(rng, 16, 5)) * (1 - joints) + 0.68 * joints, dtype=np.float32)
+    return np.asarray((0.33 + fields + 0.05 * noise(rng, 16, 5)) * (1 - joints) + 0.68 * joints, dtype=np.float32)
 
 
 def _tiles(rng: Rng) -> Map:
     fields, joints = _cells(rng, 8, 8, 4, shift=False, spread=0.10)
-    return np.asarray((0.5 + fields + 0.05 * _noise(rng, 8, 6)) * (1 - joints) + 0.15 * joints, dtype=np.float32)
+    return np.asarray((0.5 + fields + 0.05 * noise(rng, 8, 6)) * (1 - joints) + 0.15 * joints, dtype=np.float32)
 
 
 def _planks(rng: Rng) -> Map:
     fields, joints = _cells(rng, 12, 2, 2, shift=True, spread=0.08)
-    fibres = cv2.GaussianBlur(_noise(rng, 32, 5), (31, 1), 0, borderType=cv2.BORDER_REFLECT)
-    knots = (_noise(rng, 32, 2) > 2.1) * 0.15
+    fibres = cv2.GaussianBlur(noise(rng, 32, 5), (31, 1), 0, borderType=cv2.BORDER_REFLECT)
+    knots = (noise(rng, 32, 2) > 2.1) * 0.15
     return np.asarray((0.42 + fields + 0.08 * fibres - knots) * (1 - 0.75 * joints), dtype=np.float32)
 
 
 def _wood(rng: Rng) -> Map:
     y = np.mgrid[0:SIDE, 0:SIDE][0] / SIDE
-    rings = np.sin(2 * np.pi * (14 * y + 0.5 * _noise(rng, 4, 3)))
-    return np.asarray(0.36 + 0.08 * rings + 0.05 * _noise(rng, 32, 4), dtype=np.float32)
+    rings = np.sin(2 * np.pi * (14 * y + 0.5 * noise(rng, 4, 3)))
+    return np.asarray(0.36 + 0.08 * rings + 0.05 * noise(rng, 32, 4), dtype=np.float32)
 
 
 def _carpet(rng: Rng) -> Map:
     y, x = np.mgrid[0:SIDE, 0:SIDE] * (2 * np.pi / SIDE)
     pattern = np.sign(np.sin(8 * x) * np.sin(8 * y)) * (np.abs(np.sin(8 * x + 0.4) * np.sin(8 * y)) > 0.45)
-    return np.asarray(0.35 + 0.13 * pattern + 0.09 * _noise(rng, 16, 5, 0.9), dtype=np.float32)
+    return np.asarray(0.35 + 0.13 * pattern + 0.09 * noise(rng, 16, 5, 0.9), dtype=np.float32)
 
 
 def _ceiling(rng: Rng) -> Map:
     fields, joints = _cells(rng, 4, 4, 7, shift=False, spread=0.02)
-    holes = (_noise(rng, 128, 2, 0.8) > 1.7) * 0.28
+    holes = (noise(rng, 128, 2, 0.8) > 1.7) * 0.28
     return np.asarray((0.74 + fields - holes) * (1 - 0.6 * joints), dtype=np.float32)
 
 
@@ -177,7 +160,7 @@ def _books(rng: Rng) -> Map:
             cv2.rectangle(image, (x + 2, band), end, label, -1)
             x += width + int(rng.integers(1, 4))
         cv2.rectangle(image, (0, top + shelf - 6), (SIDE, top + shelf), 0.45, -1)
-    return np.asarray(image + 0.015 * _noise(rng, 64, 3), dtype=np.float32)
+    return np.asarray(image + 0.015 * noise(rng, 64, 3), dtype=np.float32)
 
 
 def _poster(rng: Rng) -> Map:
@@ -198,11 +181,11 @@ def _poster(rng: Rng) -> Map:
             cv2.rectangle(image, (x, y), (x + width, y + 11), 0.1, -1)
             x += width + 10
     cv2.rectangle(image, (0, 0), (SIDE - 1, SIDE - 1), 0.08, 14)
-    return np.asarray(image + 0.01 * _noise(rng, 64, 3), dtype=np.float32)
+    return np.asarray(image + 0.01 * noise(rng, 64, 3), dtype=np.float32)
 
 
 def _notices(rng: Rng) -> Map:
-    image = 0.36 + 0.05 * _noise(rng, 64, 3, 0.9)
+    image = 0.36 + 0.05 * noise(rng, 64, 3, 0.9)
     for row in range(3):
         for column in range(4):
             if rng.random() < 0.12:
@@ -216,8 +199,8 @@ def _notices(rng: Rng) -> Map:
 
 
 def _painting(rng: Rng) -> Map:
-    hills = _noise(rng, 4, 7, 0.75)
-    image = 0.45 + 0.2 * hills + 0.12 * np.sign(_noise(rng, 8, 4))
+    hills = noise(rng, 4, 7, 0.75)
+    image = 0.45 + 0.2 * hills + 0.12 * np.sign(noise(rng, 8, 4))
     cv2.rectangle(image, (0, 0), (SIDE - 1, SIDE - 1), 0.15, 60)
     cv2.rectangle(image, (6, 6), (SIDE - 7, SIDE - 7), 0.6, 8)
     return np.asarray(image, dtype=np.float32)
@@ -238,7 +221,7 @@ def _door(rng: Rng) -> Map:
 
 
 def _window(rng: Rng) -> Map:
-    image = 0.82 + 0.05 * _noise(rng, 4, 3)
+    image = 0.82 + 0.05 * noise(rng, 4, 3)
     skyline = 300
     for x in range(0, SIDE, 32):  # houses across the street
         skyline = int(np.clip(skyline + rng.integers(-70, 71), 180, 420))
@@ -252,7 +235,7 @@ def _window(rng: Rng) -> Map:
 
 
 def _lockers(rng: Rng) -> Map:
-    image = 0.4 + 0.02 * _noise(rng, 16, 5)
+    image = 0.4 + 0.02 * noise(rng, 16, 5)
     for x in range(0, SIDE, 128):
         cv2.rectangle(image, (x + 2, 4), (x + 125, SIDE - 5), 0.16, 4)
         for y in range(40, 120, 16):
@@ -267,22 +250,22 @@ def _lockers(rng: Rng) -> Map:
 def _fabric(rng: Rng) -> Map:
     y, x = np.mgrid[0:SIDE, 0:SIDE] * (2 * np.pi / SIDE)
     plaid = np.sign(np.sin(6 * x)) * 0.10 + np.sign(np.sin(6 * y + 1)) * 0.10 + np.sign(np.sin(18 * x)) * 0.05
-    return np.asarray(0.4 + plaid + 0.04 * _noise(rng, 64, 3), dtype=np.float32)
+    return np.asarray(0.4 + plaid + 0.04 * noise(rng, 64, 3), dtype=np.float32)
 
 
 def _cloth(rng: Rng) -> Map:
-    folds = _noise(rng, 4, 3)
-    return np.asarray(0.3 + 0.08 * folds + 0.03 * _noise(rng, 64, 3), dtype=np.float32)
+    folds = noise(rng, 4, 3)
+    return np.asarray(0.3 + 0.08 * folds + 0.03 * noise(rng, 64, 3), dtype=np.float32)
 
 
 def _stripes(rng: Rng) -> Map:
     y = np.mgrid[0:SIDE, 0:SIDE][0] * (2 * np.pi / SIDE)
-    return np.asarray(0.45 + 0.22 * np.sign(np.sin(9 * y)) + 0.05 * _noise(rng, 8, 4), dtype=np.float32)
+    return np.asarray(0.45 + 0.22 * np.sign(np.sin(9 * y)) + 0.05 * noise(rng, 8, 4), dtype=np.float32)
 
 
 def _head(rng: Rng) -> Map:
-    image = 0.5 + 0.03 * _noise(rng, 8, 4)
-    image[:170] = 0.12 + 0.03 * _noise(rng, 64, 2)[:170]
+    image = 0.5 + 0.03 * noise(rng, 8, 4)
+    image[:170] = 0.12 + 0.03 * noise(rng, 64, 2)[:170]
     for x in (150, 362):
         cv2.ellipse(image, (x, 260), (44, 20), 0, 0, 360, 0.8, -1)
         cv2.circle(image, (x, 260), 16, 0.06, -1)
@@ -317,4 +300,5 @@ _PAINTERS: dict[str, tuple[Callable[[Rng], Map], float]] = {
     "stripes": (_stripes, 0.8),
     "head": (_head, 0.3),
     "checkerboard": (lambda rng: checkerboard(8), 0.8),
+    **OUTDOOR_PAINTERS,  # new ones come last: a place in this order is the seed of a texture
 }

@@ -190,6 +190,8 @@ class Scene:
         motion: of the body; its duration is the recording's.
         exposure: returns light and gain at a time in seconds.
         events: name -> (start, end), in seconds, of the scene's hard moments.
+        rig: name of its own rig, one of `graphvio.simulation.named_rigs.NAMED_RIGS`.
+        rate_hz: of its own rig, framesets per second.
     """
 
     name: str
@@ -197,3 +199,5 @@ class Scene:
     motion: Motion
     exposure: Callable[[float], Exposure] = full_light
     events: dict[str, tuple[float, float]] = field(default_factory=dict)
+    rig: str = "paper"
+    rate_hz: float = 20.0

@@ -19,6 +19,7 @@ from graphvio.errors import GraphvioError
 from graphvio.rig import Rig
 from graphvio.simulation import RIG_CHANGES, SCENE_NAMES
 from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationError
+from graphvio.sources import open_source
 
 _SCENES = ("room", "corridor", "stairs", "calibration")
 _BOTH = "both"
@@ -61,7 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         choices=[*_PAIRS, *_SINGLES],
         default=list(_PAIRS),
         help="with the IMU, none: each camera by itself; one-camera: the first one alone; front+single: the front "
-        "pair, and a camera of the other one (default: both front back)",
+        "pair, and a camera of the other one; of a single pair, both is that pair (default: both front back)",
     )
     imu = parser.add_mutually_exclusive_group()
     imu.add_argument("--no-imu", action="store_true", help="only runs without the IMU")
@@ -103,8 +104,9 @@ def run_all(args: argparse.Namespace) -> None:
     try:
         for scene in args.scenes:
             folder = _rendered(args, scene)
+            chosen = _choices(folder, args.pairs)
             for level, seed in _draws(levels, args.first_seed, args.seeds):
-                cases = list(_cases(args, scene, level, seed))
+                cases = list(_cases(args, scene, level, seed, chosen))
                 results |= {case: known[case.key] for case in cases if case.key in known}
                 missing = [case for case in cases if case.key not in known]
                 if not missing:
@@ -163,14 +165,21 @@ def _draws(levels: Sequence[int], first_seed: int, seeds: int) -> Iterator[tuple
             yield level, 0 if level == EXACT else seed
 
 
-def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Iterator[Case]:
+def _choices(folder: Path, pairs: Sequence[str]) -> list[str]:
+    """Return those choices of cameras that a recording has; of a single pair ``both`` is all, and the only pair."""
+    if len(open_source(folder).rig.pairs) > 1:
+        return list(pairs)
+    return [each for each in pairs if each in (_BOTH, "none", "one-camera")]
+
+
+def _cases(args: argparse.Namespace, scene: str, level: int, seed: int, chosen: Sequence[str]) -> Iterator[Case]:
     duration = "whole" if args.duration is None else f"{args.duration:g}"
     components = "all" if args.components is None or level == EXACT else " ".join(sorted(args.components))
     config = " ".join([args.config, *sorted(args.set)])
     for imu in ("yes", "no"):
         if (imu == "yes" and args.no_imu) or (imu == "no" and args.imu):
             continue
-        for pairs in args.pairs:
+        for pairs in chosen:
             if imu == "no" and pairs in _SINGLES:
                 continue
             yield Case(scene, duration, args.rig_change or "none", level, components, seed, config, pairs, imu)
@@ -181,7 +190,7 @@ def _selected(rig: Rig, case: Case) -> Rig:
     n_cameras = {"one-camera": 1, "front+single": 3}.get(case.pairs)
     if n_cameras is not None:
         return rig.with_only([camera.name for camera in rig.cameras[:n_cameras]])
-    chosen = rig.without_pairs() if case.pairs == "none" else rig.with_pairs(_PAIRS[case.pairs])
+    chosen = rig.without_pairs() if case.pairs == "none" else rig.with_pairs(_PAIRS[case.pairs][: len(rig.pairs)])
     return chosen if case.imu == "yes" else chosen.without_imu()
 
 

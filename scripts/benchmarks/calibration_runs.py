@@ -156,4 +156,4 @@ def _pose_nees(estimates: Sequence[Estimate], truth: Trajectory) -> float:
 
 
 def _rms(rig: Rig, true_rig: Rig) -> dict[str, float]:
-    return {name: float(np.sqrt(np.mean(e**2))) for name, e in calibration_differences(rig, true_rig).items()}
+    return {name: float(np.sqrt(np.mean(e**2))) for name, e in calibration_differences(rig, true_rig).items() if len(e)}

@@ -9,7 +9,8 @@ import numpy as np
 from benchmarks.recordings import rendered_once
 from graphvio.simulation import SCENE_NAMES, Simulator, build_scene, write_recording
 from graphvio.simulation.motion import Walk
-from graphvio.simulation.textures import Atlas, Map, checkerboard, pack, standard_atlas
+from graphvio.simulation.noise import Map
+from graphvio.simulation.textures import Atlas, checkerboard, pack, standard_atlas
 from graphvio.simulation.world import Lamp, Scene, World
 
 CORRIDOR_S = 38.0

@@ -23,6 +23,8 @@ from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.simulation import SCENE_NAMES, simulate
 from graphvio.sources import open_source
 
+SCENES_OF_TWO_PAIRS = tuple(name for name in SCENE_NAMES if name not in ("street", "flight"))
+
 
 def add_data_option(parser: argparse.ArgumentParser) -> None:
     """Add ``--data DIR``, where simulated recordings are kept."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.command_line import add_command, add_report_options
-from benchmarks.recordings import add_data_option, simulated
+from benchmarks.recordings import SCENES_OF_TWO_PAIRS, add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine
 from benchmarks.runs import run, with_moved_pair
 from scipy.stats import chi2
@@ -28,7 +28,6 @@ from graphvio.calibration.result import Calibration
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import open_source
 
 _NOISES = ((2e-4, 4e-4), (1e-3, 2e-3), (4e-3, 8e-3))  # of a motion over a third of a second: radians, metres
@@ -47,7 +46,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``calibration``."""
     parser = add_command(subparsers, "calibration", "how well P_12 is found from motion", __doc__, main)
     parser.add_argument("--runs", type=int, default=200, help="runs of each case with synthetic errors (default: 200)")
-    parser.add_argument("--scenes", nargs="*", default=list(SCENE_NAMES), metavar="NAME", help="default: all")
+    parser.add_argument(
+        "--scenes", nargs="*", default=list(SCENES_OF_TWO_PAIRS), metavar="NAME", help="default: all of two pairs"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
     add_data_option(parser)
     add_report_options(parser)

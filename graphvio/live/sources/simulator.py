@@ -61,7 +61,7 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
     if "drift_ppm" in spec.options and speed != 1.0:
         raise SourceError("simulator: drifting clocks are estimated from arrival times: drift_ppm needs speed=1")
     recording = Path(spec.options["recording"]) if "recording" in spec.options else None
-    rig_name = choice_of(spec, "rig", tuple(NAMED_RIGS))
+    rig_name = choice_of(spec, "rig", tuple(NAMED_RIGS)) if "rig" in spec.options else None
     return SimulatedRig(
         scene,
         rig,
@@ -69,7 +69,7 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
         duration_s=number_of(spec, "duration_s", 0.1, 1e7),
         legs=whole_number_of(spec, "legs", 1, 1_000_000),
         seed=whole_number_of(spec, "seed", 0, 2**31) or 0,
-        rate_hz=rate_hz or 20.0,
+        rate_hz=rate_hz,
         recording=recording,
         rig_name=rig_name,
         faults=spec.options,
@@ -86,10 +86,10 @@ class SimulatedRig:
         duration_s: of the readings; None for no end.
         legs: number of walks, there and back counting as two; None for no end.
         seed: of all noise.
-        rate_hz: framesets per second.
+        rate_hz: framesets per second; None for the scene's own rate.
         recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders it once, as much as
             the duration takes, into graphvio's folder of the user's cache.
-        rig_name: of the rig that is rendered.
+        rig_name: of the rig that is rendered; None for the scene's own.
         faults: options of `DeviceFaults.parse`.
     """
 
@@ -102,9 +102,9 @@ class SimulatedRig:
         duration_s: float | None = None,
         legs: int | None = None,
         seed: int = 0,
-        rate_hz: float = 20.0,
+        rate_hz: float | None = None,
         recording: Path | None = None,
-        rig_name: str = "paper",
+        rig_name: str | None = None,
         faults: Mapping[str, str] | None = None,
     ) -> None:
         self.name = f"simulator-{scene}"
@@ -115,9 +115,11 @@ class SimulatedRig:
         self._duration_s = duration_s
         self._legs = legs
         self._seed = seed
-        self._rate_hz = rate_hz
+        built = build_scene(scene)
+        self._rate_hz = rate_hz if rate_hz is not None else built.rate_hz
         self._folder = recording
-        self._rig_name = rig_name
+        self._rig_name = rig_name if rig_name is not None else built.rig
+        self._is_own_rig = self._rig_name == built.rig
         self._fault_options = faults or {}
         self._faults = DeviceFaults()
         self._opened: Source | None = None
@@ -193,7 +195,7 @@ class SimulatedRig:
     def _rendered(self) -> Path:
         """Return the folder of the rendered scene, after rendering it if need be, or as much of it as is asked for."""
         root, part_s = cache_root().parent / "simulator", self._part_s()
-        rig = "" if self._rig_name == "paper" else f"-{self._rig_name}"
+        rig = "" if self._is_own_rig else f"-{self._rig_name}"
         part = "" if part_s is None else f"-{part_s}s"
         folder = root / f"{self._scene}{rig}-seed{self._seed}-{self._rate_hz:g}hz{part}-{_digest()}"
         if folder.is_dir():

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from graphvio.errors import SourceError
-from graphvio.simulation.scenes import corridor, loop, rooms, stairs
+from graphvio.simulation.scenes import corridor, flight, loop, rooms, stairs, street
 from graphvio.simulation.world import Scene
 
 _BUILDERS: dict[str, tuple[Callable[[float, float], Scene], float]] = {
     "calibration": (rooms.build_calibration, 40.0),
     "corridor": (corridor.build, 60.0),
+    "flight": (flight.build, 30.0),
     "loop": (loop.build, 73.0),
     "room": (rooms.build_room, 40.0),
     "stairs": (stairs.build, 30.0),
+    "street": (street.build, 30.0),
 }
 
 SCENE_NAMES = tuple(_BUILDERS)
@@ -25,7 +27,7 @@ def build_scene(name: str, duration_s: float | None = None, stationary_s: float 
     Args:
         name: one of `SCENE_NAMES`.
         duration_s: of the motion; None for the whole walk. After its end the body is stationary.
-        stationary_s: initial standstill; 0 begins at walking speed.
+        stationary_s: initial standstill; 0 begins at walking speed, as what flies always does.
 
     Raises:
         SourceError: if there is no such scene, or the duration is not positive.
