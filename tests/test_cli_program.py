@@ -176,7 +176,7 @@ rig nothing.txt
 compare walk walk
 evaluate walk walk
 simulate hall --out a
-simulate room --out a --rig car
+simulate room --out a --rig truck
 simulate room --out a --rig named.yaml
 simulate room --out a --calibration-error 9
 simulate room --out a --rig-change fall

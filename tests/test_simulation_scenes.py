@@ -6,7 +6,7 @@ from recordings import half_size_rig
 from graphvio.arrays import Image
 from graphvio.errors import SourceError
 from graphvio.simulation import SCENE_NAMES, Simulator, build_scene, make_simulator
-from graphvio.simulation.default_rig import default_rig
+from graphvio.simulation.named_rigs import NAMED_RIGS
 
 STRENGTH = 1e-3  # smallest eigenvalue of a corner that stands out from the noise
 
@@ -50,7 +50,7 @@ def test_scene_every_camera_sees_texture_without_holes(name: str) -> None:
     simulator = make_simulator(name)
     last = len(simulator.stamps_ns) - 1
     for index in (0, last // 5, last):
-        for camera in range(4):
+        for camera in range(len(simulator.rig.cameras)):
             view = simulator.view(index, camera)
             assert np.isfinite(view.depth).all()  # the world is closed
             assert view.depth.min() > 0.15  # nobody walks through a wall
@@ -65,7 +65,7 @@ def test_scene_cameras_keep_distance(name: str) -> None:
     world_T_body = scene.motion.at(np.arange(0.0, scene.motion.duration_s, 0.05)).world_T_body
     origin, u, v = np.array([(r.origin, r.edge_u, r.edge_v) for r in scene.world.rectangles]).swapaxes(0, 1)
     normal = np.cross(u, v)
-    for camera in default_rig().cameras:
+    for camera in NAMED_RIGS[scene.rig]().cameras:
         centres = (world_T_body @ camera.body_T_cam)[:, :3, 3]
         side = centres @ normal.T - np.sum(origin * normal, axis=1)
         step, surface = np.nonzero(side[:-1] * side[1:] <= 0.0)  # where a plane is crossed
@@ -153,3 +153,43 @@ def test_loop_legs_share_textures_and_doors() -> None:
     for index in range(len(seen)):
         for camera in (0, 2):
             assert corners(simulator.image(index, camera)) > 200
+
+
+def test_street_stands_clear_of_the_route_and_facades_are_near() -> None:
+    scene = build_scene("street")
+    track = scene.motion.at(np.arange(0.0, scene.motion.duration_s, 0.1)).world_T_body[:, :2, 3]
+    nearest = dict.fromkeys(("facade0", "facade1", "brick", "car", "leaves"), np.inf)
+    for r in scene.world.rectangles:
+        if r.texture in nearest:
+            edge = r.edge_u[:2]
+            along = np.clip((track - r.origin[:2]) @ edge / (edge @ edge), 0.0, 1.0)
+            gap = np.linalg.norm(r.origin[:2] + along[:, None] * edge - track, axis=1).min()
+            nearest[r.texture] = min(nearest[r.texture], gap)
+    assert 9.0 < min(nearest["facade0"], nearest["facade1"], nearest["brick"]) < 12.0
+    assert 2.5 < nearest["car"] < 5.0
+    assert nearest["leaves"] > 2.5
+
+
+@pytest.mark.parametrize(
+    ("name", "baseline_m", "rate_hz", "pixels"),
+    [("street", 0.537, 10.0, (1241, 376)), ("flight", 0.11, 20.0, (752, 480))],
+)
+def test_outdoor_scene_has_rig_and_rate_of_its_own(
+    name: str, baseline_m: float, rate_hz: float, pixels: tuple[int, int]
+) -> None:
+    simulator = make_simulator(name, duration_s=2.0)
+    (pair,) = simulator.rig.pairs
+    assert np.linalg.norm(pair.left.body_T_cam[:3, 3] - pair.right.body_T_cam[:3, 3]) == pytest.approx(baseline_m)
+    assert pair.left.size_px == pixels
+    assert simulator.rates_hz == (rate_hz,)
+    assert simulator.imu.rate_hz == 200.0
+    other = make_simulator(name, duration_s=2.0, rig=half_size_rig(), rate_hz=5.0)
+    assert other.rates_hz == (5.0, 5.0)
+    assert np.isfinite(other.view(4, 0).depth).all()
+
+
+def test_flight_looks_down_from_50_m() -> None:
+    simulator = make_simulator("flight", duration_s=2.0)
+    depth = simulator.view(0, 0).depth
+    assert 60.0 < np.median(depth) < 85.0  # 50 m / sin(45 degrees), apart from houses and trees
+    assert depth[-1].max() < depth[0].min()
