@@ -12,6 +12,7 @@ REQUIRED = {
     "cv2": "opencv-python-headless",
     "matplotlib": "matplotlib",
     "yaml": "pyyaml",
+    "isal": "isal",
     "jinja2": "jinja2",
     "rich": "rich",
 }
