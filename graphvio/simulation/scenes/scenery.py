@@ -40,10 +40,9 @@ def house(world: World, place: Float, size: Sequence[float], yaw: float, walls: 
     """Add a house with a flat roof, whose eaves stand out, by the centre (2,) of its ground and its size."""
     length, depth, height = size
     x, y = place.tolist()
+    roof_tint = 2.5 - 1.6 * tint  # dark on bright walls
     world.box((x, y, 0.0), (length, depth, height), walls, yaw, tint=tint)
-    world.box(
-        (x, y, height), (length + 0.8, depth + 0.8, 0.5), "roof", yaw, tint=2.5 - 1.6 * tint
-    )  # dark on bright walls
+    world.box((x, y, height), (length + 0.8, depth + 0.8, 0.5), "roof", yaw, tint=roof_tint)
 
 
 def tree(world: World, place: Float, height_m: float, number: int) -> None:
