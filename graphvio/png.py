@@ -1,6 +1,6 @@
 """Decoding of grey PNG files, of which most recordings consist, in less than half of OpenCV's time.
 
-By OpenCV, decoding the images of two pairs takes more processor time than their odometry.
+OpenCV's decoder needs two thirds of the processor time that the odometry of the images needs.
 
 Reference: Portable Network Graphics (PNG) Specification, W3C, sections 5 (chunks), 9 (filters) and 11.2.2 (IHDR).
 """
