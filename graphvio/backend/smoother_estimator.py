@@ -36,8 +36,7 @@ from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion,
 from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
-# Of the prediction's sigmas, for the gate without an IMU: fast hand-held cameras often leave constant velocity.
-_CONSTANT_VELOCITY_SCALE = 3.0
+_CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
 class SmootherEstimator:
