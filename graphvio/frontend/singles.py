@@ -35,7 +35,11 @@ class SinglesFrontend(VisualFrontend):
         self._handover = Handover(len(rig.singles))
 
     def process(
-        self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None
+        self,
+        frameset: FrameSet,
+        predict: MotionPredictor,
+        readout: ReadoutMotion | None = None,
+        turned: MotionPredictor | None = None,
     ) -> VisualResult:
         """Track the corners of a frameset.
 
@@ -43,12 +47,13 @@ class SinglesFrontend(VisualFrontend):
             frameset: Images of any subset of cameras.
             predict: The back-end's prediction, from which the search begins.
             readout: Motion of body while rolling shutters read the images out, or None.
+            turned: The gyro's rotation alone, from which the search begins where nothing is predicted.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
         self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), predict, readout)
+        seen = self._track(checked(frameset, self._rig), predict, readout, turned)
         is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
         reports = {
             j: PairReport(

@@ -96,8 +96,8 @@ class PairTracker:
         self._motion = motion if any(camera.line_time_us for camera in self._pair.cameras) else None
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
-        last, guess, inverse_depths = self._predict(left_T_left_prev)
-        pixels, found = self._follow(before, last, guess, left_T_left_prev, left_T_left_keyframe, watch)
+        last, guess, inverse_depths, is_in_view = self._predict(left_T_left_prev)
+        pixels, found = self._follow(before, last, guess, is_in_view, left_T_left_prev, left_T_left_keyframe, watch)
         rejected: dict[str, int] = {}
         stays = self._still_wanted(pixels, found, rejected)
         last = last.keep(stays)
@@ -205,11 +205,15 @@ class PairTracker:
             stays[common_rows(self._last.ids, ids)[0]] = False
             self._last = self._last.keep(stays)
 
-    def _predict(self, left_T_left_prev: Float | None) -> tuple[PairFrame, Float, Float]:
-        """Select the tracks to follow, and predict their pixels (N, 2) and inverse depths (N,), NaN if unknown."""
+    def _predict(self, left_T_left_prev: Float | None) -> tuple[PairFrame, Float, Float, Bool]:
+        """Select the tracks to follow, and predict their pixels (N, 2) and inverse depths (N,), NaN if unknown.
+
+        The last of what is returned is whether each will still be in the image (N,).
+        """
         last, camera = self._last.keep(self._last.flat_for <= _MAX_FLAT_FRAMES), self._pair.left
         if left_T_left_prev is None:
-            return last, last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
+            depths = np.where(last.has_depth, last.points[:, 2], np.nan)
+            return last, last.pixels, depths, np.ones(len(last.ids), dtype=bool)
         w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
         pixels, inverse_depths, valid = predict_pixels(
             last.left, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
@@ -218,13 +222,14 @@ class PairTracker:
             pixels, inverse_depths = pixels_at_lines(camera, pixels, inverse_depths, self._motion)
         valid &= camera.contains(pixels)
         inverse_depths[~(last.has_depth & valid)] = np.nan
-        return last, np.where(valid[:, None], pixels, last.pixels), inverse_depths
+        return last, np.where(valid[:, None], pixels, last.pixels), inverse_depths, valid
 
     def _follow(
         self,
         before: Pyramid,
         last: PairFrame,
         guess: Float,
+        is_in_view: Bool,
         left_T_left_prev: Float | None,
         left_T_left_keyframe: Float | None,
         watch: Stopwatch,
@@ -238,7 +243,8 @@ class PairTracker:
         if left_T_left_keyframe is not None and left_T_left_prev is not None:
             pixels, found = self._patches.find(last.ids, guess, self._left[0], left_T_left_keyframe, self._min_gradient)
         watch.lap("register")
-        others = np.flatnonzero(~found)
+        # What leaves the image is not looked for: next to its edge something similar would be found instead.
+        others = np.flatnonzero(~found & is_in_view)
         if len(others):
             is_near = left_T_left_prev is not None
             pixels[others], found[others] = self._tracked(before, last.pixels[others], guess[others], is_near)

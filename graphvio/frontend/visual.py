@@ -180,7 +180,11 @@ class VisualFrontend:
     # ------------------------------------------------------------------ one frameset
 
     def process(
-        self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None
+        self,
+        frameset: FrameSet,
+        predict: MotionPredictor,
+        readout: ReadoutMotion | None = None,
+        turned: MotionPredictor | None = None,
     ) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset.
 
@@ -188,12 +192,13 @@ class VisualFrontend:
             frameset: Images of any subset of pairs.
             predict: The back-end's prediction, from which the search begins.
             readout: Motion of body while rolling shutters read the images out; None continues that of the prediction.
+            turned: The gyro's rotation alone, from which the search for tracks begins where nothing is predicted.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
         self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), predict, readout)
+        seen = self._track(checked(frameset, self._rig), predict, readout, turned)
         agreement, reason = self._estimate_motion(seen, predict)
         graded_motion = self._grade(seen, agreement, reason)
         replenished, own = self._replenish(seen, agreement)
@@ -210,7 +215,13 @@ class VisualFrontend:
         )
 
     @timed("track")
-    def _track(self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None) -> _Seen:
+    def _track(
+        self,
+        frameset: FrameSet,
+        predict: MotionPredictor,
+        readout: ReadoutMotion | None,
+        turned: MotionPredictor | None,
+    ) -> _Seen:
         """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
         self._all_frozen = frozen.all_since_ns is not None
@@ -224,6 +235,8 @@ class VisualFrontend:
 
         def observe(j: int) -> PairFrame:
             since_latest = self._predicted(j, self._latest.get(j), predict)
+            if since_latest is None and turned is not None:
+                since_latest = self._predicted(j, self._latest.get(j), turned)
             since_reference = self._predicted(j, self._references.of(j), predict)
             left, *right = frameset.images[j]
             masks = frameset.masks.get(j, (None, None))

@@ -6,11 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
 from graphvio.backend.initialisation import shows_standstill
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.frontend.rolling_shutter import ReadoutMotion
+from graphvio.geometry import se3, so3_exp
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion, VisualResult
@@ -55,6 +57,7 @@ class ImuOfFramesets:
             self._clock_watch = ClockWatch(rig, self._clock, synchroniser)
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._first_ns: int | None = None
+        self._newest: tuple[int, ImuInterval] | None = None  # where the newest interval began
 
     @property
     def is_left_out(self) -> bool:
@@ -121,16 +124,33 @@ class ImuOfFramesets:
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Return the IMU between two framesets, or None where it does not cover them, or is left out."""
+        self._newest = None
         if not self._estimator.has_imu or self.is_left_out:
             return None
         interval = self._synchroniser.interval(start_ns, end_ns)
-        if interval is None:
+        if interval is not None:
+            self._newest = start_ns, interval
+        else:
             self._report(
                 end_ns,
                 EventKind.IMU_NOT_COVERING,
                 "IMU samples are missing since the frameset before: the motion is predicted without them",
             )
         return interval
+
+    def turned_since(self, then_ns: int) -> Float | None:
+        """Return ``now_T_then`` (4, 4) of body since the frameset before, by the gyro alone and without translation.
+
+        It is what can be predicted while single cameras have no pose; None of other instants, and if the gyro is
+        doubted.
+        """
+        is_doubted = self._clock_watch is not None and self._clock_watch.is_doubted
+        if self._newest is None or self._newest[0] != then_ns or is_doubted:
+            return None
+        interval, then_R_now = self._newest[1], np.eye(3)
+        for rotation_vector in interval.steps_s[:, None] * interval.angular_velocity:
+            then_R_now = then_R_now @ so3_exp(rotation_vector)
+        return se3(np.ascontiguousarray(then_R_now.T), np.zeros(3))
 
     def readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
         """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""

@@ -336,7 +336,7 @@ class Odometry:
     def _track(self, frameset: FrameSet, predicted: _Predicted) -> VisualResult:
         """Track all pairs and measure the relative motion, eq. (1) to (4)."""
         readout = self._imu.readout_motion(frameset.stamp_ns)
-        visual = self._frontend.process(frameset, self._estimator.motion_since, readout)
+        visual = self._frontend.process(frameset, self._estimator.motion_since, readout, self._imu.turned_since)
         if not predicted.is_initial:
             self._vision_events.update(frameset.stamp_ns, visual, self._frontend.misaligned)
         self.stage_ms.update(visual.stage_ms)

@@ -1,0 +1,84 @@
+"""A single camera that turns on the spot: tracks are looked for where the gyro says, and no scale is made up."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from graphvio import ImuSample, Odometry
+from graphvio.arrays import Float
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import EventKind
+from graphvio.measurements.motion import Sighting, VisualResult
+from graphvio.simulation import build_scene, default_rig
+from graphvio.simulation.motion import Motion
+from graphvio.simulation.simulator import Simulator
+
+DURATION_S, STILL_S = 5.0, 1.0
+RATE = 1.2  # rad/s: 24 pixels from image to image
+MAX_PARALLAX = 0.02  # rad from image to image: the camera is 0.18 m from body's origin, and nothing is nearer than 1 m
+
+
+class Turned(NamedTuple):
+    statuses: list[Status]
+    kinds: list[str]
+    sightings: list[Sighting]
+    world_R_cam: Float  # (N, 3, 3), true
+
+
+def course(times: Float) -> Float:
+    """Turn at one place, but for a sway of millimetres."""
+    t = np.clip(times - STILL_S, 0.0, None)
+    r = np.minimum(t / STILL_S, 1.0)
+    t = np.where(r < 1.0, STILL_S * r**4 * (2.5 - 3.0 * r + r * r), t - 0.5 * STILL_S)  # up to speed smoothly
+    sway = 0.003 * np.sin(np.outer(t, [2.1, 2.9, 3.7]) + np.array([0.0, 1.0, 0.0]))
+    tilt = 0.01 * np.sin(np.outer(t, [5.1, 6.3]))
+    return np.column_stack([np.array([-1.6, -1.9, 1.45]) + sway, RATE * t, tilt])
+
+
+@pytest.fixture(scope="module")
+def turned() -> Turned:
+    scene = replace(build_scene("room"), motion=Motion(course, DURATION_S))
+    rig = default_rig().with_only(["cam0"])
+    simulator, odometry = Simulator(scene, rig), Odometry(rig)
+    process, sightings = odometry._frontend.process, list[Sighting]()
+
+    def listened(*args: object) -> VisualResult:
+        visual = process(*args)  # type: ignore[arg-type]
+        sightings.append(visual.sightings[0])
+        return visual
+
+    odometry._frontend.process = listened  # type: ignore[method-assign,assignment]
+    track, n_samples, estimates = simulator.imu_track, 0, list[Estimate | None]()
+    for k, stamp_ns in enumerate(simulator.stamps_ns):
+        while track.stamps_ns[n_samples] <= stamp_ns:
+            values = track.angular_velocity[n_samples], track.linear_acceleration[n_samples]
+            estimates.append(odometry.process(ImuSample(int(track.stamps_ns[n_samples]), *values)))
+            n_samples += 1
+        estimates.append(odometry.process(simulator.frameset(k)))
+    world_R_cam = simulator.world_T_body[:, :3, :3] @ rig.cameras[0].body_T_cam[:3, :3]
+    statuses = [estimate.status for estimate in estimates if estimate is not None]
+    return Turned(statuses, [event.kind for event in odometry.take_events()], sightings, world_R_cam)
+
+
+def test_tracks_of_a_camera_that_turns_end_where_their_points_leave_the_image(turned: Turned) -> None:
+    """Next to the edge of the image, something similar would be found instead, again in each image."""
+    n_tracks, n_wrong = 0, 0
+    for k in range(len(turned.sightings) - 1):
+        before, now = turned.sightings[k : k + 2]
+        _, rows_before, rows_now = np.intersect1d(before.ids, now.ids, return_indices=True)
+        directions = [
+            np.column_stack([each.rays[rows], np.ones(len(rows))]) @ turned.world_R_cam[at].T
+            for each, rows, at in ((before, rows_before, k), (now, rows_now, k + 1))
+        ]
+        one, other = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in directions)
+        n_tracks += len(one)
+        n_wrong += int((np.linalg.norm(one - other, axis=1) > MAX_PARALLAX).sum())
+    assert n_tracks > 10_000
+    assert n_wrong < 0.003 * n_tracks
+
+
+def test_camera_that_turns_on_the_spot_has_no_pose(turned: Turned) -> None:
+    assert set(turned.statuses) == {Status.INITIALISING}
+    assert EventKind.SCALE_KNOWN not in turned.kinds
