@@ -15,7 +15,7 @@ from graphvio.measurements.events import EventKind
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
 from graphvio.simulation.calibration_error import CalibrationError, draw
-from graphvio.sources.base import Source
+from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 

@@ -19,7 +19,7 @@ from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.matching import TOLERANCE_NS, group_pairs, match_sides
-from graphvio.sources.recording import Recording
+from graphvio.sources.recording import Source
 from graphvio.sources.sequencer import COVER_NS, merge
 from graphvio.sources.tables import ImuTable, clean_stamps, decimal_ns, parse_stamp, read_imu_csv
 
@@ -174,7 +174,7 @@ def test_recording_memory_does_not_grow_with_length(tmp_path: Path) -> None:
     track = ImageFiles(tmp_path, stamps, ["image.png"] * frames)
     imu = ImuTable(np.arange(0, frames * 50 * MS, 5 * MS), np.zeros((10 * frames, 6)))
     index = Index("long", {"cam0": track, "cam1": track}, imu)
-    source = Recording(index, _resized(rig, size_px), FaultLog("long"))
+    source = Source(index, _resized(rig, size_px), FaultLog("long"))
     tracemalloc.start()
     count = sum(isinstance(measurement, FrameSet) for measurement in source)
     peak = tracemalloc.get_traced_memory()[1]

@@ -20,8 +20,8 @@ from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.matching import alike, known_geometry
 from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
-from graphvio.optimization.threads import in_threads
 from graphvio.rig import Camera
+from graphvio.sources.read_ahead import read_ahead
 
 _NEIGHBOURS = 2  # places after each that it is matched with
 _EPIPOLAR_PX = 4.0  # COLMAP's limit for two views
@@ -58,7 +58,7 @@ def verify_matches(
                 database.verify(first, second, None)
     listed = sorted(pairs.values(), key=lambda each: each.names)
     read = (_stored(pair, database) for pair in listed)
-    verified = in_threads(_verified, read, "graphvio-matches")
+    verified = read_ahead(_verified, read, depth=4)
     for done, (pair, (rows, is_new, geometry)) in enumerate(zip(listed, verified, strict=True), start=1):
         with database.transaction():
             if is_new:

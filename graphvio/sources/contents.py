@@ -17,7 +17,7 @@ from graphvio.sources.description import rig_line
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, ImageSequence
 from graphvio.sources.opening import layout_of, read_index
-from graphvio.sources.recording import Recording
+from graphvio.sources.recording import Source
 from graphvio.sources.regularity import Regularity, regularity
 
 
@@ -66,7 +66,7 @@ def describe_folder(path: Path, rig: Path | None = None) -> FolderDescription:
 
 def _described(path: Path, rig: Rig | None) -> FolderDescription:
     index, used, faults = read_index(path, rig, {})
-    recording = Recording(index, used, faults)
+    recording = Source(index, used, faults)
     sensors = [_camera(camera, index.images[camera.name], path, faults) for camera in used.cameras]
     if index.imu is not None:
         sensors.append(SensorDescription("imu", len(index.imu.stamps_ns), regularity(index.imu.stamps_ns)))

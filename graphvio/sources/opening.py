@@ -11,11 +11,10 @@ from graphvio.rig import Rig
 from graphvio.rig_files import find_rig
 from graphvio.sessions.store import is_store, open_store
 from graphvio.sources import euroc, kitti_odometry, kitti_raw, session, uzh_fpv
-from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
 from graphvio.sources.plug_ins import Layout, plug_ins
-from graphvio.sources.recording import Recording
+from graphvio.sources.recording import Source
 from graphvio.sources.surroundings import meant_instead
 
 _MAX_TOLERANCE_MS = 10.0
@@ -68,7 +67,7 @@ def open_source(
     try:
         index, rig, faults = read_index(path, rig, topics or {})
         tolerance_ns = None if tolerance_ms is None else round(1e6 * tolerance_ms)
-        return Recording(index, rig, faults, from_s, to_s, tolerance_ns)
+        return Source(index, rig, faults, from_s, to_s, tolerance_ns)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 

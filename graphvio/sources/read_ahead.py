@@ -17,8 +17,8 @@ def read_ahead(
 ) -> Generator[R, None, None]:
     """Yield ``map(work, items)``, with results prepared ahead in threads.
 
-    An exception of ``work`` is raised where its result is due. The threads end when the iterator is exhausted, closed
-    or collected.
+    The items are made in the calling thread, ``depth`` at most before their results are taken. An exception of ``work``
+    is raised where its result is due. The threads end when the iterator is exhausted, closed or collected.
     """
     waiting: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="graphvio-read")

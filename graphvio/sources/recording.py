@@ -35,8 +35,21 @@ class _Decoded:
     decode_ms: float
 
 
-class Recording:
-    """A recording as a `graphvio.sources.base.Source`; arguments are those of `open_source`.
+class Source:
+    """A recording as a stream of IMU samples and framesets in time order; may be iterated more than once.
+
+    Arguments are those of `graphvio.sources.open_source`, and what `graphvio.sources.opening.read_index` returns.
+
+    Attributes:
+        name: of the recording, fit for a folder of results.
+        rig: of the measurements; its IMU is None if the recording has no samples.
+        faults: of the recording; complete once an iteration has ended, and counted again by the next one.
+        frameset_count: number of framesets, of which those without usable images are not yielded.
+        stamps_ns: (N,) stamps of the framesets, camera clock, increasing.
+        start_ns: stamp of the first frameset.
+        end_ns: stamp of the last frameset.
+        truth: file, session or bag from which `load_trajectory` reads the true trajectory, or None.
+        decode_ms: time that the decoding of each frameset took in its thread, milliseconds.
 
     Raises:
         SourceError: if no frameset is left.
@@ -74,7 +87,12 @@ class Recording:
         self._opened = faults.mark()
 
     def __iter__(self) -> Iterator[Measurement]:
-        """Yield IMU samples and framesets: see `graphvio.sources.base.Source`."""
+        """Yield IMU samples and framesets; the sample that covers a frameset's instant comes before it.
+
+        Raises:
+            SourceError: at the end, if not one frameset could be read.
+            RigError: if the first image of a camera does not have the rig's size.
+        """
         self.faults.rewind(self._opened)
         self.decode_ms = []
         offset_ns = self.rig.imu.time_offset_ns if self.rig.imu else 0
@@ -82,7 +100,11 @@ class Recording:
             yield from merge(self._read_imu(), framesets, offset_ns)
 
     def frameset_at(self, stamp_ns: int) -> FrameSet:
-        """Return one frameset: see `graphvio.sources.base.Source`."""
+        """Return the usable images of one frameset, out of order; from any thread.
+
+        Raises:
+            SourceError: if there is no frameset with this stamp.
+        """
         at = int(np.searchsorted(self.stamps_ns, stamp_ns))
         if at == self.frameset_count or self.stamps_ns[at] != stamp_ns:
             raise SourceError(f"{self.name}: has no frameset at {stamp_ns}; give the recording that it is from")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warnings
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from itertools import compress
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import SourceError
 from graphvio.measurements.events import EventKind
 from graphvio.sources.faults import FaultLog
+
+R = TypeVar("R")
+V = TypeVar("V")
 
 _MAX_STAMP_NS = 2**62  # the year 2116; offsets can be added without an overflow of int64
 _HOUR_NS = 3_600_000_000_000
@@ -61,19 +65,15 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
 
 def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
     """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and names of the images."""
-    stamps: list[int] = []
-    names: list[str] = []
-    for number, cells in _rows(path):
+
+    def frame(cells: list[str]) -> tuple[int, str] | None:
         stamp = parse_stamp(cells[0])
-        if stamp is None:
-            _count_garbage(EventKind.FRAME_GARBAGE, path, number, stamps, faults)
-            continue
-        stamps.append(stamp)
-        names.append(cells[1] if len(cells) > 1 and cells[1] else f"{stamp}.png")
-    all_stamps = np.array(stamps, dtype=np.int64)
-    _refuse_other_units(all_stamps, path)
-    kept = clean_stamps(all_stamps, "frame", path, faults)
-    return all_stamps[kept], [name for name, keep in zip(names, kept, strict=True) if keep]
+        return None if stamp is None else (stamp, cells[1] if len(cells) > 1 and cells[1] else f"{stamp}.png")
+
+    stamps_ns, names = read_rows(path, _rows(path), frame, EventKind.FRAME_GARBAGE, faults)
+    _refuse_other_units(stamps_ns, path)
+    kept = clean_stamps(stamps_ns, "frame", path, faults)
+    return stamps_ns[kept], list(compress(names, kept))
 
 
 def read_times(path: Path, parse: Callable[[str], int | None], faults: FaultLog) -> tuple[Int, list[int]]:
@@ -81,18 +81,45 @@ def read_times(path: Path, parse: Callable[[str], int | None], faults: FaultLog)
 
     ``parse`` returns the nanoseconds of a line, or None if it is no time.
     """
-    lines: list[int] = []
-    stamps: list[int] = []
-    for number, line in enumerate(read_lines(path)):
-        stamp = parse(line)
-        if stamp is not None:
-            lines.append(number)
-            stamps.append(stamp)
-        elif line.strip() and not line.startswith("#"):
-            _count_garbage(EventKind.FRAME_GARBAGE, path, number + 1, stamps, faults)
-    stamps_ns = np.array(stamps, dtype=np.int64)
+
+    def frame(row: tuple[int, str]) -> tuple[int, int] | None:
+        stamp = parse(row[1])
+        return None if stamp is None else (stamp, row[0] - 1)
+
+    rows = ((number, (number, line)) for number, line in rows_in_lines(path))
+    stamps_ns, lines = read_rows(path, rows, frame, EventKind.FRAME_GARBAGE, faults)
     kept = clean_stamps(stamps_ns, "frame", path, faults)
-    return stamps_ns[kept], [line for line, keep in zip(lines, kept, strict=True) if keep]
+    return stamps_ns[kept], list(compress(lines, kept))
+
+
+def read_rows(
+    path: Path,
+    rows: Iterable[tuple[int, R]],
+    parse: Callable[[R], tuple[int, V] | None],
+    kind: EventKind,
+    faults: FaultLog,
+) -> tuple[Int, list[V]]:
+    """Return stamps (N,) and values of numbered rows; rows for which ``parse`` returns None are dropped and counted."""
+    stamps: list[int] = []
+    values: list[V] = []
+    for number, row in rows:
+        parsed = parse(row)
+        if parsed is None:
+            detail = f"{path}: line {number} is no row of this table; it is dropped"
+            faults.add(kind, stamps[-1] if stamps else 0, detail)
+            continue
+        stamps.append(parsed[0])
+        values.append(parsed[1])
+    return np.array(stamps, dtype=np.int64), values
+
+
+def imu_row(stamp_ns: int | None, cells: Sequence[str]) -> tuple[int, list[float]] | None:
+    """Return stamp and values (6,) of a sample; None if one of them is missing."""
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        return None
+    return None if stamp_ns is None or len(values) != 6 else (stamp_ns, values)
 
 
 def parse_stamp(text: str) -> int | None:
@@ -196,33 +223,27 @@ def _read_fast(path: Path) -> ImuTable | None:
 
 
 def _read_tolerant(path: Path, faults: FaultLog) -> ImuTable:
-    stamps: list[int] = []
-    values: list[list[float]] = []
-    for number, cells in _rows(path):
-        stamp = parse_stamp(cells[0])
-        try:
-            sample = [float(cell) for cell in cells[1:7]]
-        except ValueError:
-            sample = []
-        if stamp is None or len(sample) != 6:
-            _count_garbage(EventKind.IMU_GARBAGE, path, number, stamps, faults)
-            continue
-        stamps.append(stamp)
-        values.append(sample)
-    return ImuTable(np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64).reshape(-1, 6))
+    def sample(cells: list[str]) -> tuple[int, list[float]] | None:
+        return imu_row(parse_stamp(cells[0]), cells[1:7])
+
+    stamps_ns, values = read_rows(path, _rows(path), sample, EventKind.IMU_GARBAGE, faults)
+    return ImuTable(stamps_ns, np.array(values, dtype=np.float64).reshape(-1, 6))
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of each row that is neither blank, comment nor a header in words."""
-    is_first = True
+    """Line number and cells of each row but a header in words."""
+    for count, (number, line) in enumerate(rows_in_lines(path)):
+        cells = _cells(line)
+        if count or any(_is_number(cell) for cell in cells):
+            yield number, cells
+
+
+def rows_in_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the number, from 1, and the text of each line that is neither blank nor a comment."""
     for number, line in enumerate(read_lines(path), start=1):
         line = line.strip()
-        if not line or line.startswith("#"):
-            continue
-        cells = _cells(line)
-        if not (is_first and not any(_is_number(cell) for cell in cells)):
-            yield number, cells
-        is_first = False
+        if line and not line.startswith("#"):
+            yield number, line
 
 
 def _cells(line: str) -> list[str]:
@@ -246,7 +267,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _count_garbage(kind: EventKind, path: Path, number: int, stamps: list[int], faults: FaultLog) -> None:
-    faults.add(kind, stamps[-1] if stamps else 0, f"{path}: line {number} is no row of this table; it is dropped")

@@ -15,7 +15,16 @@ from graphvio.measurements.events import EventKind
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
-from graphvio.sources.tables import ImuTable, clean_stamps, decimal_ns, read_lines, read_times
+from graphvio.sources.tables import (
+    ImuTable,
+    clean_stamps,
+    decimal_ns,
+    imu_row,
+    read_lines,
+    read_rows,
+    read_times,
+    rows_in_lines,
+)
 
 LAYOUT = "UZH-FPV: left_images.txt"
 _FILES = {"cam0": "left_images.txt", "cam1": "right_images.txt"}
@@ -51,23 +60,12 @@ def _image_stamp(line: str) -> int | None:
 
 
 def _read_imu(path: Path, faults: FaultLog) -> ImuTable:
-    stamps: list[int] = []
-    values: list[list[float]] = []
-    for number, line in enumerate(read_lines(path), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        cells = line.split()
-        try:
-            sample = [float(cell) for cell in cells[2:8]]
-        except ValueError:
-            sample = []
-        stamp = decimal_ns(cells[1], _NS_PER_S) if len(cells) > 1 else None
-        if stamp is None or len(sample) != 6 or not np.isfinite(sample).all():
-            detail = f"{path}: line {number} is no row of this table; it is dropped"
-            faults.add(EventKind.IMU_GARBAGE, stamps[-1] if stamps else 0, detail)
-            continue
-        stamps.append(stamp)
-        values.append(sample)
-    stamps_ns = np.array(stamps, dtype=np.int64)
+    stamps_ns, values = read_rows(path, rows_in_lines(path), _sample, EventKind.IMU_GARBAGE, faults)
     kept = clean_stamps(stamps_ns, "imu", path, faults)
     return ImuTable(stamps_ns[kept], np.array(values, dtype=np.float64).reshape(-1, 6)[kept])
+
+
+def _sample(line: str) -> tuple[int, list[float]] | None:
+    cells = line.split()
+    row = imu_row(decimal_ns(cells[1], _NS_PER_S) if len(cells) > 1 else None, cells[2:8])
+    return row if row is not None and np.isfinite(row[1]).all() else None

@@ -23,8 +23,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.mapping.mapper import Mapper
-from graphvio.sources import open_source
-from graphvio.sources.base import Source
+from graphvio.sources import Source, open_source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 

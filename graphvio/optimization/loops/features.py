@@ -18,9 +18,9 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.places import PairObserver, SingleObserver
 from graphvio.optimization.loops.sift import Extractor, SiftExtractor, SiftProcess
-from graphvio.optimization.threads import in_threads
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import Source
+from graphvio.sources.read_ahead import read_ahead
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def extract_places(
         def look(stamp_ns: int) -> dict[int, PairFeatures]:
             return observer.look(source.frameset_at(stamp_ns))
 
-        for stamp_ns, seen in zip(missing, in_threads(look, missing, "graphvio-features"), strict=True):
+        for stamp_ns, seen in zip(missing, read_ahead(look, missing, depth=4), strict=True):
             store_place(database, rig, session, stamp_ns, seen)
             done += 1
             on_progress(done)
