@@ -21,8 +21,8 @@ from graphvio.errors import FleetError
 from graphvio.fleet.listing import list_sessions
 from graphvio.fleet.run import optimize_fleet
 from graphvio.fleet.storage import Storage, file_system
-from graphvio.fleet.tasks import Reading
 from graphvio.rig_files import load_rig
+from graphvio.sources.reading import Reading
 
 
 @pytest.fixture(scope="module")

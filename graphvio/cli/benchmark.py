@@ -9,7 +9,7 @@ import typer
 
 from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, ends_at_interrupt, warn
 
 if TYPE_CHECKING:
     from graphvio.benchmark.table import Benchmark
@@ -86,7 +86,7 @@ def benchmark(
     at_once = min(jobs if jobs is not None else max(1, (os.cpu_count() or 1) // 2), len(found))
     warm_up_visibly(default_rig(), settings)  # once, and not as a part of each sequence's time
     passed = ["--config", config] + (["--no-imu"] if no_imu else []) + ([] if to_s is None else ["--to", str(to_s)])
-    try:
+    with ends_at_interrupt(f"interrupted; what was finished is in {results}"):
         outcomes = run_sequences(
             found,
             results,
@@ -94,9 +94,6 @@ def benchmark(
             jobs=at_once,
             on_done=lambda each: warn(f"{each.sequence}: {each.reason or 'done'}"),
         )
-    except KeyboardInterrupt:
-        warn(f"interrupted; what was finished is in {results}")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
     measured = Benchmark(chosen, str(folder), config, at_once, outcomes)
     page = write_report(measured, results)
     publish(measured.as_dict() | {"report": str(page)})

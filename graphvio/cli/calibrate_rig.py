@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, stage_bars, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, ends_at_interrupt, stage_bars, warn
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from graphvio.config import Config
     from graphvio.odometry.recorded_calibration import RecordedCalibration
     from graphvio.sources import Source
@@ -25,17 +22,13 @@ def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None,
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.odometry.recorded_calibration import calibrate_recording
     from graphvio.rig_files import save_rig
-    from graphvio.runtime import interruptible, set_up_threads
+    from graphvio.runtime import set_up_threads
 
     set_up_threads()
     warm_up_visibly(opened.rig, settings)
-    try:
-        with interruptible(), stage_bars() as bars:
-            show = show_stages(bars, {"odometry": opened.frameset_count})
-            found = calibrate_recording(opened, opened.rig, what, settings, show)
-    except KeyboardInterrupt:
-        warn("interrupted; nothing is written")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+    totals = {"odometry": opened.frameset_count}
+    with ends_at_interrupt("interrupted; nothing is written"), stage_bars(totals) as show:
+        found = calibrate_recording(opened, opened.rig, what, settings, show)
     publish(_document(found))
     _print(found)
     if not found.is_consistent:
@@ -50,19 +43,6 @@ def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None,
         typer.echo(f"report: {write_rig_report(found, report, opened.name)}")
     if not (found.is_complete and found.is_consistent):
         raise typer.Exit(EXIT_INCOMPLETE)
-
-
-def show_stages(bars: Progress, totals: dict[str, int]) -> Callable[[str, int, int], None]:
-    """Return a function that shows how far a stage is, in a bar of its own; totals may be known beforehand."""
-    tasks: dict[str, TaskID] = {}
-
-    def show(stage: str, done: int, total: int) -> None:
-        total = totals.get(stage, total)
-        if stage not in tasks:
-            tasks[stage] = bars.add_task(stage, total=total)
-        bars.update(tasks[stage], completed=done, total=total)
-
-    return show
 
 
 def _document(found: RecordedCalibration) -> dict[str, object]:

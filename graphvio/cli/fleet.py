@@ -9,7 +9,7 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish, with_json
-from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parsed_cameras, parsed_pairs, parsed_topics, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, ends_at_interrupt, reading_of, warn
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -63,13 +63,8 @@ def optimize(
     cameras: options.Cameras = None,
     no_pairs: options.NoPairs = False,
     no_imu: options.NoImu = False,
-    no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
-    refine_calibration: Annotated[
-        bool,
-        typer.Option(
-            "--refine-calibration", help="Also estimate where the pairs are, and the IMU's time offset, in the graph."
-        ),
-    ] = False,
+    no_loops: options.NoLoops = False,
+    refine_calibration: options.RefineCalibration = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
@@ -93,7 +88,6 @@ def optimize(
     from graphvio.fleet.cluster import distributed
     from graphvio.fleet.listing import list_sessions
     from graphvio.fleet.run import optimize_fleet
-    from graphvio.fleet.tasks import Reading
     from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.rig_files import load_rig
 
@@ -104,31 +98,27 @@ def optimize(
         colmap()
     settings = Config.load(config)
     loaded = None if rig is None else load_rig(rig)
-    numbers = None if pairs is None else tuple(parsed_pairs(pairs))
-    names = None if cameras is None else tuple(parsed_cameras(cameras))
-    reading = Reading(numbers, names, not no_pairs, not no_imu, tuple(parsed_topics(topics).items()), from_s, to_s)
+    reading = reading_of(
+        pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
+    )
     listed = list_sessions(sessions)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are printed below
-    try:
-        with _bars() as bars:
-            task = bars.add_task("0 tasks", total=len(listed))
-            outcomes = optimize_fleet(
-                listed,
-                out,
-                settings,
-                rig=loaded,
-                with_loops=not no_loops,
-                calibrates=refine_calibration,
-                reading=reading,
-                scheduler=scheduler,
-                workers=workers,
-                on_progress=lambda progress: bars.update(
-                    task, completed=progress.optimized + progress.failed, description=_description(progress)
-                ),
-            )
-    except KeyboardInterrupt:
-        warn(f"interrupted; the same command with --out {out} continues from there")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+    with ends_at_interrupt(f"interrupted; the same command with --out {out} continues from there"), _bars() as bars:
+        task = bars.add_task("0 tasks", total=len(listed))
+        outcomes = optimize_fleet(
+            listed,
+            out,
+            settings,
+            rig=loaded,
+            with_loops=not no_loops,
+            calibrates=refine_calibration,
+            reading=reading,
+            scheduler=scheduler,
+            workers=workers,
+            on_progress=lambda progress: bars.update(
+                task, completed=progress.optimized + progress.failed, description=_description(progress)
+            ),
+        )
     if not _print_outcomes(outcomes, out):
         raise typer.Exit(EXIT_INCOMPLETE)
 

@@ -27,7 +27,7 @@ def live(
     config: options.ConfigName = "default",
     record: options.Record = None,
     png: options.Png = False,
-    view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,
+    view: options.View = False,
     serve: Annotated[
         bool, typer.Option("--serve", help="Serve other programs of this machine, see graphvio serve.")
     ] = False,

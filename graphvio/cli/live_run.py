@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, chosen_rig, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, reading_of, warn
 
 if TYPE_CHECKING:
     from graphvio.cli.services import Services, Started
@@ -120,7 +120,7 @@ def _opened(source: str, rig: Path | None, cameras: str | None, no_pairs: bool) 
     opened = open_live_source(source, None if rig is None else load_rig(rig))
     if cameras is None and not no_pairs:
         return opened
-    return SelectedCameras(opened, lambda whole: chosen_rig(whole, cameras=cameras, no_pairs=no_pairs))
+    return SelectedCameras(opened, reading_of(cameras=cameras, no_pairs=no_pairs).of)
 
 
 def _show_until_end(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,16 +12,15 @@ from graphvio.cli import options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
-    EXIT_INTERRUPTED,
     MIN_COMPLETION,
+    ends_at_interrupt,
     open_recording,
+    reading_of,
     stage_bars,
     warn,
 )
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from graphvio.optimization.optimize import Optimization
 
 
@@ -50,13 +48,8 @@ def optimize(
     cameras: options.Cameras = None,
     no_pairs: options.NoPairs = False,
     no_imu: options.NoImu = False,
-    no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
-    refine_calibration: Annotated[
-        bool,
-        typer.Option(
-            "--refine-calibration", help="Also estimate where the pairs are, and the IMU's time offset, in the graph."
-        ),
-    ] = False,
+    no_loops: options.NoLoops = False,
+    refine_calibration: options.RefineCalibration = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
@@ -84,62 +77,31 @@ def optimize(
     from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.results import ResultWriter
-    from graphvio.runtime import interruptible, set_up_threads
+    from graphvio.runtime import set_up_threads
 
     if not no_loops:
         colmap()  # before hours of work, not after
     settings = Config.load(config)
-    opened = [
-        open_recording(
-            source,
-            rig,
-            settings,
-            pairs=pairs,
-            cameras=cameras,
-            no_pairs=no_pairs,
-            no_imu=no_imu,
-            from_s=from_s,
-            to_s=to_s,
-            topics=topics,
-        )
-        for source in sources
-    ]
+    reading = reading_of(
+        pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
+    )
+    opened = [open_recording(source, rig, settings, reading) for source in sources]
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")
     set_up_threads()
     for source in opened:
         warm_up_visibly(source.rig, settings)
-    try:
-        with interruptible(), stage_bars() as bars:
-            found = optimize_sessions(
-                opened,
-                folder,
-                settings,
-                with_loops=not no_loops,
-                calibrates=refine_calibration,
-                on_progress=_show_stages(bars),
-            )
-    except KeyboardInterrupt:
-        warn(f"interrupted; the same command with --out {folder} continues from there")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+    message = f"interrupted; the same command with --out {folder} continues from there"
+    with ends_at_interrupt(message), stage_bars() as show:
+        found = optimize_sessions(
+            opened, folder, settings, with_loops=not no_loops, calibrates=refine_calibration, on_progress=show
+        )
     complete = [_print_session(folder / session.record.name) for session in found.sessions]
     publish(json.loads((folder / "summary.json").read_text(encoding="utf-8")) | {"results": str(folder)})
     print_summary(found, folder)
     if not all(complete):
         raise typer.Exit(EXIT_INCOMPLETE)
-
-
-def _show_stages(bars: Progress) -> Callable[[str, float, float], None]:
-    """Return a function that shows how far a stage is, in a bar of its own."""
-    tasks: dict[str, TaskID] = {}
-
-    def show(stage: str, done: float, total: float) -> None:
-        if stage not in tasks:
-            tasks[stage] = bars.add_task(stage, total=total)
-        bars.update(tasks[stage], completed=done, total=total)
-
-    return show
 
 
 def _print_session(session: Path) -> bool:

@@ -65,6 +65,15 @@ NoPairs = Annotated[
 NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]
 FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.", callback=seconds)]
 ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.", callback=seconds)]
+View = Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")]
+SaveRrd = Annotated[Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")]
+NoLoops = Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")]
+RefineCalibration = Annotated[
+    bool,
+    typer.Option(
+        "--refine-calibration", help="Also estimate where the pairs are, and the IMU's time offset, in the graph."
+    ),
+]
 Png = Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")]
 SessionOut = Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")]
 LiveSource = Annotated[

@@ -12,10 +12,11 @@ from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
-    EXIT_INTERRUPTED,
     check_session_name,
+    ends_at_interrupt,
     framesets_bar,
     open_recording,
+    reading_of,
     warn,
 )
 
@@ -57,16 +58,14 @@ def record(
 
     check_session_name(out)
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+    reading = reading_of(no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+    opened = open_recording(source, rig, settings, reading)
     set_up_threads()
     warm_up_visibly(opened.rig, settings)
     writer = SessionWriter(out, opened.rig, "png" if png else "raw")
     truth = _truth(opened, is_whole=from_s is None and to_s is None)
-    try:
+    with ends_at_interrupt(f"interrupted; what was recorded until then is in {out}, which can be read"):
         _write(opened, truth, writer, Odometry(opened.rig, settings))
-    except KeyboardInterrupt:
-        warn(f"interrupted; what was recorded until then is in {out}, which can be read")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
     publish({"out": str(out), "size_bytes": out.stat().st_size, "poses": writer.poses, "stopped": writer.stopped})
     typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {writer.poses} poses")
     _exit_if_stopped(writer)
@@ -110,7 +109,7 @@ def convert(
     from graphvio.sessions.formats import format_of, open_writer
 
     known = format_of(out, file_format)
-    opened = open_recording(source, rig, Config(), from_s=from_s, to_s=to_s, topics=topics)
+    opened = open_recording(source, rig, Config(), reading_of(from_s=from_s, to_s=to_s, topics=topics))
     truth = _truth(opened, is_whole=from_s is None and to_s is None)
     writer = open_writer(out, opened.rig, known, "png" if png else "raw")
     _write(opened, truth, writer, None)

@@ -11,10 +11,11 @@ from graphvio.cli import options
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
-    EXIT_INTERRUPTED,
     MIN_COMPLETION,
     TerminalDisplay,
+    ends_at_interrupt,
     open_recording,
+    reading_of,
     warn,
 )
 
@@ -40,10 +41,8 @@ def run(
     no_imu: options.NoImu = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
-    view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,
-    save_rrd: Annotated[
-        Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
-    ] = None,
+    view: options.View = False,
+    save_rrd: options.SaveRrd = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Estimate the trajectory of a recording.
@@ -67,14 +66,14 @@ def run(
     from graphvio.pipeline import RunListener
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
-    from graphvio.runtime import interruptible, set_up_threads
+    from graphvio.runtime import set_up_threads
     from graphvio.viewer import Viewer
 
     settings = Config.load(config)
-    opened = open_recording(
-        source, rig, settings, pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s,
-        to_s=to_s, topics=topics,
-    )  # fmt: skip
+    reading = reading_of(
+        pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
+    )
+    opened = open_recording(source, rig, settings, reading)
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))
@@ -87,12 +86,8 @@ def run(
         set_up_threads()
         warm_up_visibly(opened.rig, settings, wait_for_calibration=False)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
-        try:
-            with interruptible():
-                summary = run_pipeline(opened, settings, writer, listeners)
-        except KeyboardInterrupt:
-            warn(f"interrupted; what was estimated until then is in {folder}")
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+        with ends_at_interrupt(f"interrupted; what was estimated until then is in {folder}"):
+            summary = run_pipeline(opened, settings, writer, listeners)
     publish(asdict(summary) | {"results": str(folder)})
     _print_summary(summary, folder)
     if summary.completion < MIN_COMPLETION:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from graphvio.config import Config
-    from graphvio.rig import Rig
     from graphvio.sources import Source
+    from graphvio.sources.reading import Reading
     from graphvio.trajectory import Trajectory
 
 EXIT_BAD_INPUT = 2
@@ -87,37 +87,38 @@ def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
     return load_trajectory(path, times)
 
 
-def open_recording(
-    source: Path,
-    rig: Path | None,
-    settings: Config,
+def open_recording(source: Path, rig: Path | None, settings: Config, reading: Reading) -> Source:
+    """Open a recording as the options of a command ask for it, see `reading_of`."""
+    from graphvio.rig_files import load_rig
+
+    check_scene(source)
+    return reading.open(source, None if rig is None else load_rig(rig), settings.timing.simultaneous_ms)
+
+
+def reading_of(
     *,
     pairs: str | None = None,
     cameras: str | None = None,
     no_pairs: bool = False,
     no_imu: bool = False,
-    from_s: float | None,
-    to_s: float | None,
-    topics: str | None,
-) -> Source:
-    """Open a recording as the options of a command ask for it, see `graphvio.cli.options`."""
-    from graphvio.rig_files import load_rig
-    from graphvio.sources import open_source
-    from graphvio.sources.faults import unlogged
+    from_s: float | None = None,
+    to_s: float | None = None,
+    topics: str | None = None,
+) -> Reading:
+    """Parse what the options of a command, see `graphvio.cli.options`, say of what is read."""
+    from graphvio.errors import RigError, SourceError
+    from graphvio.sources.reading import Reading
 
-    check_scene(source)
-    tolerance_ms = settings.timing.simultaneous_ms
-    loaded = None if rig is None else load_rig(rig)
-    mapped = parsed_topics(topics)
-
-    def opened(rig: Rig | None) -> Source:
-        return open_source(source, rig, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
-
-    if not (pairs or cameras or no_pairs or no_imu):
-        return opened(loaded)
-    with unlogged():  # the faults are those of the cameras that are chosen
-        whole = opened(loaded).rig
-    return opened(chosen_rig(whole, pairs, cameras, no_pairs, no_imu))
+    try:
+        numbers = tuple(int(each) for each in pairs.split(",")) if pairs else None
+    except ValueError:
+        raise RigError(f"--pairs {pairs}: give numbers separated by commas, such as 0,1") from None
+    names = tuple(name.strip() for name in cameras.split(",")) if cameras else None
+    mapped = [each.split("=") for each in (topics or "").split(",") if each]
+    if any(len(pair) != 2 or not all(pair) for pair in mapped):
+        raise SourceError(f"--topics {topics}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
+    topic_of = {name.strip(): topic.strip() for name, topic in mapped}
+    return Reading(numbers, names, not no_pairs, not no_imu, tuple(topic_of.items()), from_s, to_s)
 
 
 def check_scene(source: Path) -> None:
@@ -134,44 +135,6 @@ def check_scene(source: Path) -> None:
             f"{source}: does not exist; the simulated walk of that name is made by  "
             f"graphvio simulate {source} --out {source}"
         )
-
-
-def parsed_topics(text: str | None) -> dict[str, str]:
-    """Parse names of cameras, or ``imu``, with their topics."""
-    from graphvio.errors import SourceError
-
-    pairs = [each.split("=") for each in (text or "").split(",") if each]
-    if any(len(pair) != 2 or not all(pair) for pair in pairs):
-        raise SourceError(f"--topics {text}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
-    return {name.strip(): topic.strip() for name, topic in pairs}
-
-
-def parsed_pairs(text: str) -> list[int]:
-    """Parse the numbers of stereo pairs."""
-    from graphvio.errors import RigError
-
-    try:
-        return [int(each) for each in text.split(",")]
-    except ValueError:
-        raise RigError(f"--pairs {text}: give numbers separated by commas, such as 0,1") from None
-
-
-def parsed_cameras(text: str) -> list[str]:
-    """Parse the names of cameras."""
-    return [name.strip() for name in text.split(",")]
-
-
-def chosen_rig(
-    rig: Rig, pairs: str | None = None, cameras: str | None = None, no_pairs: bool = False, no_imu: bool = False
-) -> Rig:
-    """Return the rig as the options of a command ask for it."""
-    if pairs is not None:
-        rig = rig.with_pairs(parsed_pairs(pairs))
-    if cameras is not None:
-        rig = rig.with_only(parsed_cameras(cameras))
-    if no_pairs:
-        rig = rig.without_pairs()
-    return rig.without_imu() if no_imu else rig
 
 
 def check_session_name(path: Path) -> None:
@@ -195,13 +158,39 @@ def framesets_bar() -> Progress:
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
-def stage_bars() -> Progress:
-    """Return progress bars that stay, one for each stage: description, count and elapsed time."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+@contextmanager
+def stage_bars(totals: Mapping[str, int] | None = None) -> Iterator[Callable[[str, float, float], None]]:
+    """Show progress bars that stay, one for each stage: description, count and elapsed time.
 
+    Yields the function that shows how far a stage is; totals may be known beforehand.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+    tasks: dict[str, TaskID] = {}
     columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def show(stage: str, done: float, total: float) -> None:
+            total = (totals or {}).get(stage, total)
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield show
+
+
+@contextmanager
+def ends_at_interrupt(message: str) -> Iterator[None]:
+    """End the command at Ctrl-C inside, with a message and the exit code of interrupted ones."""
+    from graphvio.runtime import interruptible
+
+    try:
+        with interruptible():
+            yield
+    except KeyboardInterrupt:
+        warn(message)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 class TerminalDisplay:

@@ -9,7 +9,7 @@ import typer
 
 from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_INTERRUPTED, framesets_bar, warn
+from graphvio.cli.shared import ends_at_interrupt, framesets_bar
 
 if TYPE_CHECKING:
     from graphvio.rig import Rig
@@ -113,17 +113,14 @@ def simulate(
     if rig is not None:
         true_rig = rig_of(rig)
         _check_names(true_rig, rig)
-    try:
-        with framesets_bar() as bar:
-            task = bar.add_task(f"rendering {name}", total=None)
-            recording = simulate_recording(
-                name, out, duration_s=duration, seed=seed, rate_hz=rate, trigger_offset_ms=trigger_offset_ms,
-                calibration_error=error, calibration_seed=calibration_seed, rig_change=rig_change, rig=true_rig,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        warn(f"interrupted; {out} has only a part of the images: remove it")
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+    message = f"interrupted; {out} has only a part of the images: remove it"
+    with ends_at_interrupt(message), framesets_bar() as bar:
+        task = bar.add_task(f"rendering {name}", total=None)
+        recording = simulate_recording(
+            name, out, duration_s=duration, seed=seed, rate_hz=rate, trigger_offset_ms=trigger_offset_ms,
+            calibration_error=error, calibration_seed=calibration_seed, rig_change=rig_change, rig=true_rig,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
     _print_recording(recording)
 
 

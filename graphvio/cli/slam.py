@@ -34,9 +34,7 @@ def slam(
     view: Annotated[bool, typer.Option("--view", help="Show both trajectories in the rerun viewer.")] = False,
     ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
-    save_rrd: Annotated[
-        Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
-    ] = None,
+    save_rrd: options.SaveRrd = None,
     record: options.Record = None,
     png: options.Png = False,
     health_port: options.HealthPort = None,

@@ -17,6 +17,7 @@ from graphvio.fleet.storage import Storage, local_path
 from graphvio.fleet.table import Outcome, write_tables
 from graphvio.optimization.loops.colmap_library import colmap
 from graphvio.rig import Rig
+from graphvio.sources.reading import Reading
 
 PLACES_PER_TASK = 200
 """Places whose features one task extracts: about 80 m of a walk, and about ten seconds of work."""
@@ -46,7 +47,7 @@ def optimize_fleet(
     rig: Rig | None = None,
     with_loops: bool = True,
     calibrates: bool = False,
-    reading: tasks.Reading | None = None,
+    reading: Reading | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     places_per_task: int = PLACES_PER_TASK,
@@ -92,7 +93,7 @@ def optimize_fleet(
             rig,
             with_loops,
             places_per_task,
-            reading or tasks.Reading(),
+            reading or Reading(),
             calibrates,
         )
         for each in sessions

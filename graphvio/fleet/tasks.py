@@ -29,7 +29,8 @@ from graphvio.optimization.record import SessionRecord
 from graphvio.optimization.workspace import digest
 from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
-from graphvio.sources import Source, open_source
+from graphvio.sources import Source
+from graphvio.sources.reading import Reading
 from graphvio.trajectory_files import load_trajectory
 from graphvio.version import __version__
 
@@ -37,33 +38,6 @@ ODOMETRY, LOOPS, GRAPH = "odometry", "loops", "graph"
 
 _ONE_AT_A_TIME = threading.Lock()  # the odometry has threads of its own, and recordings share a place
 _STATE = "stages.json"  # of a folder that one process works in from the first stage to the last
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What is read of each recording, as by the options of ``graphvio optimize``."""
-
-    pairs: tuple[int, ...] | None = None  # numbers of the stereo pairs; None for all
-    cameras: tuple[str, ...] | None = None  # names of the cameras; None for all
-    with_pairs: bool = True  # whether pairs stay pairs; else each camera is a single one
-    with_imu: bool = True  # whether the IMU is used
-    topics: tuple[tuple[str, str], ...] = ()  # cameras of the rig, or ``imu``, with their topics
-    from_s: float | None = None  # second of the recording to begin at
-    to_s: float | None = None  # second to end at
-
-    def open(self, path: Path, rig: Rig | None, config: Config) -> Source:
-        """Open a recording."""
-
-        def opened(of: Rig | None) -> Source:
-            tolerance_ms, topics = config.timing.simultaneous_ms, dict(self.topics)
-            return open_source(path, of, from_s=self.from_s, to_s=self.to_s, tolerance_ms=tolerance_ms, topics=topics)
-
-        source = opened(rig)
-        chosen = source.rig if self.pairs is None else source.rig.with_pairs(list(self.pairs))
-        chosen = chosen if self.cameras is None else chosen.with_only(list(self.cameras))
-        chosen = chosen if self.with_pairs else chosen.without_pairs()
-        chosen = chosen if self.with_imu else chosen.without_imu()
-        return source if chosen is source.rig else opened(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +51,7 @@ class Job:
     rig: Rig | None  # rig, or None for the recording's own
     with_loops: bool  # whether loop closures are searched
     places_per_task: int  # maximum number of places whose features one task extracts
-    reading: Reading = Reading()  # what is read of the recording
+    reading: Reading = field(default_factory=Reading)  # what is read of the recording
     calibrates: bool = False  # whether the graph has extrinsics and time offset as variables
     version: str = __version__  # version of graphvio
 
@@ -222,7 +196,7 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], chan
         if stage in done:
             return done[stage]
         recording = fetch_recording(job.recording, kept)
-        source = job.reading.open(recording, job.rig, job.config)
+        source = job.reading.open(recording, job.rig, job.config.timing.simultaneous_ms)
         stages = Stages(
             [Session(job.name, source)], scratch, job.config, with_loops=job.with_loops, calibrates=job.calibrates
         )

@@ -1,0 +1,44 @@
+"""What is read of a recording: a part of its rig and of its time, and which topics are whose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphvio.rig import Rig
+from graphvio.sources.faults import unlogged
+from graphvio.sources.opening import open_source
+from graphvio.sources.recording import Source
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What is read of each recording, as by the options of ``graphvio optimize``."""
+
+    pairs: tuple[int, ...] | None = None  # numbers of the stereo pairs; None for all
+    cameras: tuple[str, ...] | None = None  # names of the cameras; None for all
+    with_pairs: bool = True  # whether pairs stay pairs; else each camera is a single one
+    with_imu: bool = True  # whether the IMU is used
+    topics: tuple[tuple[str, str], ...] = ()  # cameras of the rig, or ``imu``, with their topics
+    from_s: float | None = None  # second of the recording to begin at
+    to_s: float | None = None  # second to end at
+
+    def of(self, rig: Rig) -> Rig:
+        """Return the part of a rig that is read."""
+        rig = rig if self.pairs is None else rig.with_pairs(list(self.pairs))
+        rig = rig if self.cameras is None else rig.with_only(list(self.cameras))
+        rig = rig if self.with_pairs else rig.without_pairs()
+        return rig if self.with_imu else rig.without_imu()
+
+    def open(self, path: Path, rig: Rig | None, tolerance_ms: float | None) -> Source:
+        """Open a recording; see `open_source`."""
+
+        def opened(of: Rig | None) -> Source:
+            topics = dict(self.topics)
+            return open_source(path, of, from_s=self.from_s, to_s=self.to_s, tolerance_ms=tolerance_ms, topics=topics)
+
+        if self.pairs is None and self.cameras is None and self.with_pairs and self.with_imu:
+            return opened(rig)
+        with unlogged():  # the faults are those of the cameras that are chosen
+            whole = opened(rig).rig
+        return opened(self.of(whole))
