@@ -23,7 +23,7 @@ from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
 from graphvio.geometry import se3_inverse, so3_exp, so3_log
 from graphvio.live.running import LiveOdometry
-from graphvio.live.selection import SelectedCameras
+from graphvio.live.source import SelectedCameras
 from graphvio.live.sources import open_live_source
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import AnyArray
-from graphvio.optimization.point_cloud import Points, model_points, ply
+from graphvio.optimization.exchange import Points, model_points, ply
 
 _TYPES = {"float": "<f4", "uchar": "u1"}
 

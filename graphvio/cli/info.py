@@ -14,8 +14,7 @@ from graphvio.cli.shared import check_scene
 
 if TYPE_CHECKING:
     from graphvio.sessions.stamps import Clock
-    from graphvio.sources.description import Synchronisation, TopicDescription
-    from graphvio.sources.regularity import Regularity
+    from graphvio.sources.description import Regularity, Synchronisation, TopicDescription
 
 
 def info(

@@ -113,7 +113,7 @@ def run_live(
 
 def _opened(source: str, rig: Path | None, cameras: str | None, no_pairs: bool) -> LiveSource:
     """Make a source as the options of a command ask for it; no sensor is started."""
-    from graphvio.live.selection import SelectedCameras
+    from graphvio.live.source import SelectedCameras
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
 

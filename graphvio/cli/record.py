@@ -23,7 +23,7 @@ from graphvio.cli.shared import (
 if TYPE_CHECKING:
     from graphvio.measurements.sensors import Measurement
     from graphvio.odometry import Odometry
-    from graphvio.sessions.formats import RecordingWriter
+    from graphvio.sessions.storage import RecordingWriter
     from graphvio.sessions.writer import SessionWriter
     from graphvio.sources import Source
     from graphvio.trajectory import Trajectory

@@ -1,4 +1,4 @@
-"""The result in other formats: trajectory (TUM), covariances and frames (CSV), pose graph (g2o)."""
+"""The result in other formats: trajectory (TUM), covariances and frames (CSV), pose graph (g2o), points (PLY)."""
 
 from __future__ import annotations
 
@@ -6,17 +6,25 @@ import os
 from collections.abc import Iterator
 from errno import ENOSPC
 from pathlib import Path
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
+from graphvio.arrays import AnyArray, Float
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.graph import poses_of
+from graphvio.optimization.loops.colmap_library import colmap
 from graphvio.optimization.optimize import Optimization, OptimizedSession
 from graphvio.optimization.solver import Edge, Marginals
 from graphvio.results.writer import COVARIANCE_HEADER, covariance_row
 from graphvio.trajectory_files import tum_line
+
+_POINT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]  # as viewers read it
+)
+_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 def trajectory_text(session: OptimizedSession) -> str:
@@ -85,3 +93,29 @@ def _odometry_edges(optimization: Optimization) -> Iterator[Edge]:
                 marginals = marginals or Marginals(optimization.graph_alone, optimization.alone)
                 yield Edge(first + n - 1, first + n, *marginals.motion(first + n - 1, first + n))
         first += len(nodes.rows)
+
+
+class Points(NamedTuple):
+    """Points of a frame of the optimisation."""
+
+    positions: Float  # (N, 3) in nav, metres
+    grey: AnyArray  # (N,) uint8, mean of the images that see the point
+
+
+def model_points(model: Path) -> Points:
+    """Read the points of a COLMAP model, in the order of their ids."""
+    points = [point for _, point in sorted(colmap().Reconstruction(model).points3D.items())]
+    positions = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    return Points(positions, np.array([point.color[0] for point in points], dtype=np.uint8))
+
+
+def ply(points: Points) -> bytes:
+    """Return points as a binary PLY file."""
+    rows = np.zeros(len(points.grey), dtype=_POINT)
+    for axis, values in zip("xyz", points.positions.T, strict=True):
+        rows[axis] = values
+    for channel in ("red", "green", "blue"):
+        rows[channel] = points.grey
+    properties = [f"property {_PLY_TYPES[kind.str]} {name}" for name, (kind, *_) in (_POINT.fields or {}).items()]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
+    return "\n".join(header).encode() + rows.tobytes()

@@ -14,7 +14,7 @@ from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
 from graphvio.errors import TrajectoryError
 from graphvio.optimization.colmap_export import export
-from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
+from graphvio.optimization.exchange import covariance_text, frames_text, model_points, ply, trajectory_text, write_g2o
 from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
 from graphvio.optimization.loops.database import FeatureDatabase
@@ -22,7 +22,6 @@ from graphvio.optimization.loops.features import extract_places
 from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import SessionInput, find_loops
 from graphvio.optimization.optimize import Optimization, optimize
-from graphvio.optimization.point_cloud import model_points, ply
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.optimization.report.write import write_plan, write_report
 from graphvio.optimization.session_calibration import FINDINGS, calibrated_rig

@@ -10,6 +10,7 @@ from typing import Any
 from graphvio.errors import MissingExtraError, SessionError
 from graphvio.sessions import cdr, ros1
 from graphvio.sessions.messages import STAMPED
+from graphvio.sessions.store import Store
 from graphvio.sessions.topics import Place, Topic
 
 try:
@@ -19,22 +20,15 @@ except ImportError:
     raise MissingExtraError("rosbags", "sessions", "reading a bag") from None
 
 
-class BagFile:
-    """A bag, ``NAME.bag`` or the folder of a ROS 2 bag: see `graphvio.sessions.store.Store`.
+class BagFile(Store):
+    """A bag, ``NAME.bag`` or the folder of a ROS 2 bag.
 
     Its messages are read as those of ROS 2, of the topics that are wanted. The whole bag is read once for the stamps of
     its messages' headers; messages are read again when they are wanted.
     """
 
     def __init__(self, path: Path, is_wanted: Callable[[str], bool] = lambda topic: True) -> None:
-        self.path = path
-        self.library = ""
-        self.topics: dict[str, Topic] = {}
-        self.attachments: dict[str, bytes] = {}
-        self.is_whole = True
-        self.damages: list[str] = []
-        self.has_damaged_attachment = False
-        self.damaged_chunks = 0
+        super().__init__(path)
         self._lock = threading.Lock()
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -20,26 +19,24 @@ from graphvio.rig_files import save_rig
 from graphvio.rig_files.native import FILE_NAME
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
-from graphvio.sessions.storage import exists_error, not_writable_error
+from graphvio.sessions.storage import RecordingWriter, exists_error, not_writable_error
 
 if TYPE_CHECKING:
     from graphvio.measurements.events import Event
 
-_log = logging.getLogger(__name__)
 _COMMENT = "converted by graphvio"
 
 
-class EurocWriter:
+class EurocWriter(RecordingWriter):
     """Writes measurements as a folder; values of the IMU and poses read back to the last digit.
 
-    Images have the stamps of their framesets. When the disk is full writing stops, as with `SessionWriter`.
+    Images have the stamps of their framesets.
 
     Args:
         path: of the folder, which must not exist, or be empty.
         rig: of the framesets.
 
     Attributes:
-        stopped: why writing stopped, or None.
         rig: as written: its cameras are renamed to ``cam0``, ``cam1`` and so on if they have other names.
 
     Raises:
@@ -49,9 +46,7 @@ class EurocWriter:
     def __init__(self, path: Path, rig: Rig) -> None:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise exists_error(path)
-        self.path = path
-        self.rig = _renamed(rig)
-        self.stopped: str | None = None
+        super().__init__(path, _renamed(rig))
         self._mav0 = path / "mav0"
         self._stamps: dict[str, list[int]] = {camera.name: [] for camera in self.rig.cameras}
         self._tables: dict[str, TextIO] = {}
@@ -62,28 +57,15 @@ class EurocWriter:
             self._open.close()
             raise not_writable_error(path, error) from None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def add(self, measurement: Measurement) -> None:
         """Write an IMU sample or a frameset."""
-        try:
-            if self.stopped is None:
-                self._add(measurement)
-        except OSError as error:
-            self._stop(error)
+        self._guarded(lambda: self._add(measurement))
 
     def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
         """Write a pose ``world_T_body`` (4, 4) of the true trajectory."""
-        try:
-            if self.stopped is None:
-                quat_wxyz = quat_wxyz_from_rotation(np.ascontiguousarray(world_T_body[:3, :3]))
-                self._add_row(TRUTH_FOLDER, euroc_layout.exact_row(stamp_ns, [*world_T_body[:3, 3], *quat_wxyz]))
-        except OSError as error:
-            self._stop(error)
+        quat_wxyz = quat_wxyz_from_rotation(np.ascontiguousarray(world_T_body[:3, :3]))
+        row = euroc_layout.exact_row(stamp_ns, [*world_T_body[:3, 3], *quat_wxyz])
+        self._guarded(lambda: self._add_row(TRUTH_FOLDER, row))
 
     def add_event(self, event: Event) -> None:
         """Ignore the event: the layout has no place for it."""
@@ -95,8 +77,7 @@ class EurocWriter:
                 self._write_sensors()
             self._open.close()
         except OSError as error:
-            if self.stopped is None:
-                self._stop(error)
+            self._stop(error)
 
     def _begin(self) -> None:
         self._mav0.mkdir(parents=True)
@@ -145,10 +126,6 @@ class EurocWriter:
             (self._mav0 / IMU_FOLDER / "sensor.yaml").write_text(euroc_layout.imu_yaml(self.rig.imu, _COMMENT))
         if TRUTH_FOLDER in self._tables:
             (self._mav0 / TRUTH_FOLDER / "sensor.yaml").write_text(euroc_layout.truth_yaml(_COMMENT))
-
-    def _stop(self, error: OSError) -> None:
-        self.stopped = f"{self.path}: writing stopped ({error.strerror}); what was written until then can be read"
-        _log.error("%s", self.stopped)
 
 
 def _renamed(rig: Rig) -> Rig:

@@ -3,49 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol, Self
 
-from graphvio.arrays import Float
 from graphvio.errors import SessionError
-from graphvio.measurements.events import Event
-from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.sessions.euroc_writer import EurocWriter
+from graphvio.sessions.storage import RecordingWriter
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
 FORMATS = ("mcap", "rosbag1", "rosbag2", "euroc")
 
 _BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag1"}
-
-
-class RecordingWriter(Protocol):
-    """Writes the measurements of a source.
-
-    Attributes:
-        stopped: why writing stopped, or None.
-    """
-
-    stopped: str | None
-
-    @property
-    def rig(self) -> Rig:
-        """Rig as written."""
-
-    def __enter__(self) -> Self:
-        """Return the writer."""
-
-    def __exit__(self, *_: object) -> None:
-        """Finish the file or folder."""
-
-    def add(self, measurement: Measurement) -> None:
-        """Write an IMU sample or a frameset."""
-
-    def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
-        """Write a pose ``world_T_body`` (4, 4) of the true trajectory."""
-
-    def add_event(self, event: Event) -> None:
-        """Write an event if the format has a place for it."""
 
 
 def format_of(path: Path, asked: str | None) -> str:

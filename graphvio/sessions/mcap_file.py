@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from graphvio.errors import MissingExtraError, SessionError
+from graphvio.sessions.store import Store
 from graphvio.sessions.topics import Place, Topic
 
 try:
@@ -37,21 +38,16 @@ _MAX_STAMP_NS = 2**62
 _DAMAGE = (McapError, struct.error, ValueError, IndexError, OverflowError, MemoryError)
 
 
-class McapFile:
-    """An MCAP file: see `graphvio.sessions.store.Store`.
+class McapFile(Store):
+    """An MCAP file.
 
     Raises:
         SessionError: if it cannot be read or is no MCAP file.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.library = ""
-        self.topics: dict[str, Topic] = {}
-        self.attachments: dict[str, bytes] = {}
-        self.is_whole = False
-        self.damages: list[str] = []
-        self.has_damaged_attachment = False
+        super().__init__(path)
+        self.is_whole = False  # until its end is found
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Topic] = {}
         self._pending: list[tuple[int, Any]] = []  # chunks and indexes of channels that are not known yet

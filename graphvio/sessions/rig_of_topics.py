@@ -10,10 +10,10 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.cameras import MODEL_NAMES, N_COEFFICIENTS
 from graphvio.errors import RigError, SessionError
-from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
+from graphvio.geometry import se3_inverse
 from graphvio.rig import Camera, Imu, Rig, StereoPair, checked_views
 from graphvio.sessions import cdr
-from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, ROS_DISTORTIONS, TRANSFORMS
+from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, ROS_DISTORTIONS, TRANSFORMS, pose_of
 from graphvio.sessions.topics import MessageReader, Topic, camera_of, is_mask, of_type, preference
 
 _MODELS = {ROS_DISTORTIONS.get(model, model): model for model in MODEL_NAMES}
@@ -156,8 +156,7 @@ def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
     """Return (parent, child) -> ``parent_T_child`` (4, 4) of a ``TFMessage``, and the inverses."""
     made: dict[tuple[str, str], Float] = {}
     for each in message.transforms:
-        q, t = each.transform.rotation, each.transform.translation
-        pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
+        pose = pose_of(each)
         parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
         made[parent, child], made[child, parent] = pose, se3_inverse(pose)
     return made

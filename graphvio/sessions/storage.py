@@ -1,11 +1,75 @@
-"""The interface of the file formats to which a session is written."""
+"""The interfaces of what writes recordings, and of the file formats to which a session is written."""
 
 from __future__ import annotations
 
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
+from graphvio.arrays import Float
 from graphvio.errors import SessionError
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import Measurement
+from graphvio.rig import Rig
+
+_log = logging.getLogger(__name__)
+
+
+class RecordingWriter(ABC):
+    """Writes the measurements of a source; a context manager that closes it.
+
+    When the disk is full or nothing can be written any more, writing stops; this is logged, `stopped` says why, and
+    later calls do nothing.
+
+    Attributes:
+        path: of the file or folder.
+        rig: of the framesets, as written.
+        stopped: why writing stopped, or None.
+    """
+
+    _work = "writing"
+    _remainder = "what was written until then can be read"
+
+    def __init__(self, path: Path, rig: Rig) -> None:
+        self.path = path
+        self.rig = rig
+        self.stopped: str | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def add(self, measurement: Measurement) -> None:
+        """Write an IMU sample or a frameset."""
+
+    @abstractmethod
+    def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
+        """Write a pose ``world_T_body`` (4, 4) of the true trajectory."""
+
+    @abstractmethod
+    def add_event(self, event: Event) -> None:
+        """Write an event if the format has a place for it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Finish the file or folder; a second time does nothing."""
+
+    def _guarded(self, write: Callable[[], None]) -> None:
+        if self.stopped is None:
+            try:
+                write()
+            except OSError as error:
+                self._stop(error)
+
+    def _stop(self, error: OSError) -> None:
+        if self.stopped is None:
+            self.stopped = f"{self.path}: {self._work} stopped ({error.strerror}); {self._remainder}"
+            _log.error("%s", self.stopped)
 
 
 class Storage(Protocol):

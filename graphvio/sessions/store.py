@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
-from graphvio.sessions.topics import MessageReader
+from graphvio.sessions.topics import Place, Topic
 
 
-class Store(MessageReader, Protocol):
-    """A session or bag, for any number of threads.
+class Store(ABC):
+    """A session or bag, for any number of threads; a `graphvio.sessions.topics.MessageReader`."""
 
-    Attributes:
-        path: of the file, or of the folder of a ROS 2 bag.
-        topics: name -> topic.
-        library: that wrote it; empty for bags.
-        attachments: name -> content; none in bags.
-        is_whole: whether its writing was finished.
-        damages: one line for each record that cannot be used.
-        has_damaged_attachment: whether an attachment is among them.
-    """
+    def __init__(self, path: Path) -> None:
+        self.path = path  # of the file, or of the folder of a ROS 2 bag
+        self.topics: dict[str, Topic] = {}  # by name
+        self.library = ""  # that wrote it; empty for bags
+        self.attachments: dict[str, bytes] = {}  # by name; none in bags
+        self.is_whole = True  # whether its writing was finished
+        self.damages: list[str] = []  # one line for each record that cannot be used
+        self.has_damaged_attachment = False  # whether an attachment is among them
 
-    library: str
-    attachments: dict[str, bytes]
-    is_whole: bool
-    damages: list[str]
-    has_damaged_attachment: bool
+    @abstractmethod
+    def read(self, place: Place) -> bytes:
+        """See `graphvio.sessions.topics.MessageReader`."""
 
     @property
     def damaged_chunks(self) -> int:
-        """How many of the chunks that have been read so far are damaged."""
+        """How many of the chunks that have been read so far are damaged; bags have none."""
+        return 0
 
 
 def is_store(path: Path) -> bool:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import cv2
 
@@ -16,6 +15,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sessions import messages
 from graphvio.sessions.mcap_storage import McapStorage
+from graphvio.sessions.storage import RecordingWriter
 from graphvio.sessions.topics import (
     IMU_TOPIC,
     LOG_TOPIC,
@@ -35,14 +35,9 @@ if TYPE_CHECKING:
 
     from graphvio.sessions.storage import Storage
 
-_log = logging.getLogger(__name__)
 
-
-class SessionWriter:
+class SessionWriter(RecordingWriter):
     """Writes measurements, estimates, the true trajectory and events.
-
-    When the disk is full or the file cannot be written any more, recording stops; this is logged, `stopped` says why,
-    and later calls do nothing.
 
     Args:
         path: of the file or folder, which must not exist.
@@ -51,14 +46,14 @@ class SessionWriter:
         storage: creates the file or folder: MCAP, which loses at most the last second in a crash, or a bag.
 
     Attributes:
-        rig: of the framesets.
-        stopped: why recording stopped, or None.
         poses: number of estimates that were recorded.
 
     Raises:
         SessionError: if the file exists or cannot be created, or from any method if messages cannot hold a stamp.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
+
+    _work = "recording"
 
     def __init__(
         self,
@@ -67,10 +62,8 @@ class SessionWriter:
         image_format: ImageFormat = "raw",
         storage: Callable[[Path], Storage] = McapStorage,
     ) -> None:
-        self.path = path
-        self.stopped: str | None = None
+        super().__init__(path, rig)
         self.poses = 0
-        self.rig = rig
         self._rig_text = to_text(rig, path.parent)
         self._format: ImageFormat = image_format
         self._has_begun = False
@@ -78,14 +71,10 @@ class SessionWriter:
         self._last_ns = 0
         self._is_closed = False
         self._storage = storage(path)
+        if not self._storage.is_readable_when_cut:
+            self._remainder = "what was written until then cannot be read: remove it, make room and begin again"
         if self._storage.has_attachments:
             self._guarded(lambda: self._storage.attach(RIG_ATTACHMENT, self._rig_text))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def add(self, measurement: Measurement) -> None:
         """Record an IMU sample or a frameset."""
@@ -123,8 +112,7 @@ class SessionWriter:
         try:
             self._storage.close()
         except OSError as error:
-            if self.stopped is None:
-                self._stop(error)
+            self._stop(error)
 
     def _add_frameset(self, frameset: FrameSet) -> None:
         if not self._has_begun:
@@ -157,19 +145,3 @@ class SessionWriter:
 
     def _add(self, topic: str, stamp_ns: int, message: Any, is_latched: bool = False) -> None:
         self._storage.write(topic, stamp_ns, message, is_latched)
-
-    def _guarded(self, action: Callable[[], None]) -> None:
-        if self.stopped is None:
-            try:
-                action()
-            except OSError as error:
-                self._stop(error)
-
-    def _stop(self, error: OSError) -> None:
-        remainder = (
-            "what was written until then can be read"
-            if self._storage.is_readable_when_cut
-            else "what was written until then cannot be read: remove it, make room and begin again"
-        )
-        self.stopped = f"{self.path}: recording stopped ({error.strerror}); {remainder}"
-        _log.error("%s", self.stopped)

@@ -13,12 +13,11 @@ from graphvio.image_decoding import ImageError
 from graphvio.measurements.events import EventKind
 from graphvio.rig import Camera, Rig
 from graphvio.rig_files import load_rig
-from graphvio.sources.description import rig_line
+from graphvio.sources.description import Regularity, regularity, rig_line
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, ImageSequence
 from graphvio.sources.opening import layout_of, read_index
 from graphvio.sources.recording import Source
-from graphvio.sources.regularity import Regularity, regularity
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from graphvio.arrays import Int
 from graphvio.errors import RigError, SessionError
 from graphvio.rig import Rig
@@ -13,10 +15,21 @@ from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.stamps import Clock, Offset, all_header_stamps, compare_clocks, compare_topics
 from graphvio.sessions.store import Store, is_store, open_store
 from graphvio.sessions.topics import Topic
-from graphvio.sources.regularity import Regularity, regularity
 from graphvio.sources.session import rig_in
 
-_NS_PER_S = 1e9
+_GAP_PERIODS = 1.5
+_MIN_STAMPS = 3
+_NS_PER_MS, _NS_PER_S = 1e6, 1e9
+
+
+@dataclass(frozen=True)
+class Regularity:
+    """Intervals between stamps."""
+
+    rate_hz: float | None  # by the median interval; None if that is zero
+    jitter_ms: float  # standard deviation of the intervals without gaps
+    gaps: int  # number of intervals longer than one and a half median ones
+    longest_ms: float  # longest interval
 
 
 @dataclass(frozen=True)
@@ -98,6 +111,29 @@ def describe(path: Path) -> Description:
     )
 
 
+def regularity(stamps_ns: Int) -> Regularity | None:
+    """Measure the intervals between stamps.
+
+    Args:
+        stamps_ns: (N,) in any order, nanoseconds.
+
+    Returns:
+        The figures, or None if there are too few stamps, or all are equal.
+    """
+    stamps = np.sort(stamps_ns)
+    if len(stamps) < _MIN_STAMPS or stamps[0] == stamps[-1]:
+        return None
+    steps = np.diff(stamps).astype(np.float64)
+    median = float(np.median(steps))
+    within = steps[steps <= _GAP_PERIODS * median]
+    return Regularity(
+        rate_hz=_NS_PER_S / median if median else None,
+        jitter_ms=float(np.std(within)) / _NS_PER_MS,
+        gaps=int(np.sum(steps > _GAP_PERIODS * median)),
+        longest_ms=float(steps.max()) / _NS_PER_MS,
+    )
+
+
 def rig_line(rig: Rig) -> str:
     """Describe a rig in one line: its name, its pairs and single cameras, and whether it has an IMU."""
     parts = [f"pairs {', '.join(pair.name for pair in rig.pairs)}"] if rig.pairs else []
@@ -110,9 +146,7 @@ def _rig(store: Store) -> str:
         rig = rig_in(store)
     except (RigError, SessionError) as error:
         return f"not usable: {error}"
-    if rig is None:
-        return ""
-    return rig_line(rig)
+    return "" if rig is None else rig_line(rig)
 
 
 def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
