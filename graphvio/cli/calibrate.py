@@ -116,10 +116,9 @@ def _deliver(
     correct_imu: bool,
 ) -> None:
     """Print where the pairs are, write what is asked for, and say by the exit code whether all of it is known."""
-    from graphvio.calibration.report.document import document, write_document
+    from graphvio.calibration.report.document import write_document
     from graphvio.rig_files import save_rig
 
-    publish(document(found))
     _print_result(found)
     if out is not None:
         numbers = out.with_suffix(".calibration.yaml")
@@ -129,10 +128,7 @@ def _deliver(
             typer.echo(f"wrote {out}, and all numbers to {numbers}")
         else:
             warn(f"{out} is not written, only {numbers}: the motions determine a part only")
-    if report is not None:
-        _write_report(found, report, name, framesets)
-    if not found.is_complete:
-        raise typer.Exit(EXIT_INCOMPLETE)
+    _finish(found, report, name, framesets)
 
 
 def calibrate_trajectories(
@@ -158,7 +154,7 @@ def calibrate_trajectories(
         graphvio calibrate-trajectories a.csv b.csv c.csv --report calibration
     """
     from graphvio.calibration.calibrate import calibrate_trajectories as calibrate_all
-    from graphvio.calibration.report.document import document, write_document
+    from graphvio.calibration.report.document import write_document
     from graphvio.trajectory_files import load_trajectory
 
     mode = _scale_mode(scale)
@@ -167,15 +163,11 @@ def calibrate_trajectories(
     names = names_of(trajectories)
     with _working("calibrating clocks and cameras"):
         found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
-    publish(document(found))
     _print_result(found)
     if out is not None:
         write_document(found, out)
         typer.echo(f"wrote {out}")
-    if report is not None:
-        _write_report(found, report, ", ".join(names), len(read[0]))
-    if not found.is_complete:
-        raise typer.Exit(EXIT_INCOMPLETE)
+    _finish(found, report, ", ".join(names), len(read[0]))
 
 
 def _is_of_pairs(what: str, given: Mapping[str, bool]) -> bool:
@@ -238,7 +230,9 @@ def _print_result(found: Calibration) -> None:
     from rich.console import Console
 
     from graphvio.calibration.pair_calibration import size_in_words
+    from graphvio.calibration.report.document import document
 
+    publish(document(found))
     Console(soft_wrap=True).print(_table(found))
     for (i, j), each in found.places.pairwise.items():
         errors = each.frame_errors_m if len(each.frames) else each.alignment_errors_m
@@ -286,9 +280,13 @@ def _with_sigma(value: float, sigma: float, known: bool) -> str:
     return f"{value:.{digits}f} ± {sigma:.{digits}f}" if known else "unknown"
 
 
-def _write_report(found: Calibration, folder: Path, source: str, count: int) -> None:
-    from graphvio.calibration.report.page import write_report
+def _finish(found: Calibration, report: Path | None, source: str, count: int) -> None:
+    """Write the report if it is asked for, and say by the exit code whether all was found."""
+    if report is not None:
+        from graphvio.calibration.report.page import write_report
 
-    with _working("writing the report"):
-        page = write_report(found, folder, source, count)
-    typer.echo(f"report: {page}")
+        with _working("writing the report"):
+            page = write_report(found, report, source, count)
+        typer.echo(f"report: {page}")
+    if not found.is_complete:
+        raise typer.Exit(EXIT_INCOMPLETE)

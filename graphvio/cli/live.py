@@ -60,10 +60,15 @@ def live(
         return
     if source is None:
         raise typer.BadParameter("give a SOURCE, or --list to see the connected devices")
+    services = None
+    if serve:
+        from graphvio.slam.service.options import ServiceOptions
+
+        services = Services(ServiceOptions())
     run_live(
         source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=view,
         health_port=health_port, duration_s=duration, forget_calibration=forget_calibration,
-        services=Services() if serve else None,
+        services=services,
     )  # fmt: skip
 
 

@@ -51,18 +51,11 @@ def serve(
         graphvio serve oak --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file token
     """
     from graphvio.cli.services import Services
+    from graphvio.slam.service.options import DEFAULT_PORT, ServiceOptions
 
+    grpc = ServiceOptions(host, DEFAULT_PORT if port is None else port, certificate, key, token_file)
     run_live(
-        source,
-        rig,
-        config,
-        cameras=cameras,
-        no_pairs=no_pairs,
-        record=record,
-        png=png,
-        view=False,
-        health_port=health_port,
-        duration_s=duration,
-        forget_calibration=forget_calibration,
-        services=Services(host, port, certificate, key, token_file, ros2, web),
-    )
+        source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=False,
+        health_port=health_port, duration_s=duration, forget_calibration=forget_calibration,
+        services=Services(grpc, ros2, web),
+    )  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -36,11 +35,7 @@ class Started:
 class Services:
     """Choice of services, and who may use them."""
 
-    host: str = "127.0.0.1"  # address of gRPC; other addresses than this machine's own need TLS and a token
-    port: int | None = None  # port of gRPC; None takes the default
-    certificate: Path | None = None  # PEM file of the server's certificate
-    key: Path | None = None  # PEM file of its private key
-    token_file: Path | None = None  # file with the clients' secret
+    grpc: ServiceOptions
     ros2_domain: int | None = None  # domain of the ROS 2 topics, or None for none
     web_port: int | None = None  # port of the page for browsers, or None for none
 
@@ -52,7 +47,7 @@ class Services:
         """Raise the error of a service that cannot run, before sensors are started."""
         from graphvio.slam.service.server import check
 
-        check(self._options())
+        check(self.grpc)
         if self.ros2_domain is not None:
             from graphvio.ros2.publisher import Publisher  # noqa: F401
 
@@ -60,8 +55,8 @@ class Services:
         """Serve an odometry until the stack closes; a `KeyboardInterrupt` where the run is to stop before that."""
         from graphvio.slam.service.server import GrpcServer
 
-        address = stack.enter_context(_until_read(GrpcServer(running, self._options()))).address
-        lines = [f"gRPC: {address}" + (" (TLS)" if self.certificate else "")]
+        address = stack.enter_context(_until_read(GrpcServer(running, self.grpc))).address
+        lines = [f"gRPC: {address}" + (" (TLS)" if self.grpc.certificate else "")]
         if self.ros2_domain is None:
             return Started(address, lines)
         from graphvio.ros2.parameters import flatten
@@ -71,12 +66,6 @@ class Services:
         publisher = stack.enter_context(Publisher(running, self.ros2_domain, parameters=parameters))
         lines.append(f"ROS 2: node {NODE} in domain {self.ros2_domain}")
         return Started(address, lines, publisher.check)
-
-    def _options(self) -> ServiceOptions:
-        from graphvio.slam.service.options import DEFAULT_PORT, ServiceOptions
-
-        port = DEFAULT_PORT if self.port is None else self.port
-        return ServiceOptions(self.host, port, self.certificate, self.key, self.token_file)
 
 
 @contextmanager

@@ -55,6 +55,7 @@ def slam(
     """
     from graphvio.errors import MapError
     from graphvio.mapping.saved_map import check_map, check_target
+    from graphvio.slam.service.options import ServiceOptions
 
     if saved_map is not None:
         check_map(saved_map)
@@ -65,7 +66,7 @@ def slam(
     if save_rrd is not None and save_rrd.exists():
         raise MapError(f"{save_rrd}: exists; name another file for --save-rrd")
     services = _WithMapping(
-        port=0, ros2_domain=ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
+        ServiceOptions(port=0), ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
     )
     run_live(
         source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=False,

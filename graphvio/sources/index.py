@@ -42,14 +42,7 @@ class ImageFiles:
     names: Sequence[str]  # of the files
 
     def read(self, row: int) -> Image:
-        """Return the image of a row, (height, width) uint8; from any thread.
-
-        Args:
-            row: index of its stamp.
-
-        Raises:
-            ImageError: if it is missing or damaged.
-        """
+        """See `ImageSequence.read`."""
         return read_grey(self.folder / self.names[row])
 
 

@@ -16,7 +16,7 @@ from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.config import Config
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
-from graphvio.optimization.loops.places import PairObserver, SingleObserver
+from graphvio.optimization.loops.places import ImageObserver, PairObserver
 from graphvio.optimization.loops.sift import Extractor, SiftExtractor, SiftProcess
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import Source
@@ -68,16 +68,16 @@ class PlaceObserver:
         return [observer for observer in self.groups if isinstance(observer, PairObserver)]
 
     @property
-    def groups(self) -> Sequence[PairObserver | SingleObserver]:
+    def groups(self) -> Sequence[ImageObserver]:
         """Observers of the rig's pairs and single cameras, for the calling thread."""
         if not hasattr(self._of_thread, "groups"):
             self._of_thread.groups = [
                 PairObserver(group, self._config)
                 if isinstance(group, StereoPair)
-                else SingleObserver(group.left, self._config)
+                else ImageObserver(group.left, self._config)
                 for group in self._rig.groups
             ]
-        made: Sequence[PairObserver | SingleObserver] = self._of_thread.groups
+        made: Sequence[ImageObserver] = self._of_thread.groups
         return made
 
     def look(self, frameset: FrameSet) -> dict[int, PairFeatures]:

@@ -44,8 +44,8 @@ def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) ->
     return np.array(chosen, dtype=np.int64)
 
 
-class SingleObserver:
-    """Finds out which features in one single camera's image may be used."""
+class ImageObserver:
+    """Finds out which features in one camera's image may be used."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self._allowed = UsablePixels(camera, config.tracking.window_px).always
@@ -56,19 +56,13 @@ class SingleObserver:
         return inside & usable
 
 
-class PairObserver:
-    """Finds the depth of features in one pair's left image by stereo matching."""
+class PairObserver(ImageObserver):
+    """Also finds the depth of features in one pair's left image by stereo matching."""
 
     def __init__(self, pair: StereoPair, config: Config) -> None:
-        window_px = config.tracking.window_px
+        super().__init__(pair.left, config)
         self.pair = pair
-        self._allowed = UsablePixels(pair.left, window_px).always
-        self._matcher = StereoMatcher(pair, config, UsablePixels(pair.right, window_px).always)
-
-    def usable(self, pixels: Float) -> Bool:
-        """Return which pixels (N, 2) are inside the left image and not masked."""
-        inside, usable = usable_at(pixels, self._allowed, 0.0)
-        return inside & usable
+        self._matcher = StereoMatcher(pair, config, UsablePixels(pair.right, config.tracking.window_px).always)
 
     def observe(
         self,
