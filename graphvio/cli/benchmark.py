@@ -41,7 +41,6 @@ def benchmark(
     config: options.ConfigName = "default",
     no_imu: options.NoImu = False,
     to_s: options.ToS = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Run the sequences of a public data set that a folder holds, and compare with published figures.
 

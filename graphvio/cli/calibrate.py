@@ -54,7 +54,6 @@ def calibrate(
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     seed: options.Seed = 0,
-    verbose: options.Verbose = False,
 ) -> None:
     """Calibrate a rig from a recording of its motion: where its stereo pairs are, or all of its parameters.
 
@@ -140,7 +139,6 @@ def calibrate_trajectories(
     report: options.ReportFolder = None,
     scale: options.Scale = "auto",
     seed: options.Seed = 0,
-    verbose: options.Verbose = False,
 ) -> None:
     """Find where cameras are relative to each other from their trajectories, whatever odometry made them.
 

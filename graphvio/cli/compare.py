@@ -42,7 +42,6 @@ def compare(
         ),
     ] = None,
     times: options.Times = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Compare several results: ATE, RPE, drift and completion, and the ratio of each ATE to the first one.
 

@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from graphvio.cli import options
 from graphvio.cli.json_output import publish
 from graphvio.cli.requirements import REQUIRED
 
@@ -27,9 +26,7 @@ _OPTIONAL = {
 }
 
 
-def doctor(
-    verbose: options.Verbose = False,
-) -> None:
+def doctor() -> None:
     """Show what graphvio finds on this machine: versions, cores, optional parts, compiled kernels.
 
     Examples:

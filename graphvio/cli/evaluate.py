@@ -33,7 +33,6 @@ def evaluate(
         typer.Option(help="Longest gap of the truth that is interpolated, seconds.", callback=options.not_negative),
     ] = 0.25,
     times: options.Times = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, drift and loop-closure error.
 

@@ -67,7 +67,6 @@ def optimize(
     refine_calibration: options.RefineCalibration = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Optimise many sessions, each by itself, and write a table.
 

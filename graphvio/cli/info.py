@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 def info(
     source: options.Source,
     rig: options.RigFile = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Show what a recording holds: its duration, its rig, and cameras and IMU with their rates, gaps and jitter.
 
@@ -92,7 +91,6 @@ def dump_config(
     profile: Annotated[
         str, typer.Argument(help="Profile or YAML file.", autocompletion=completion.profile)
     ] = "default",
-    verbose: options.Verbose = False,
 ) -> None:
     """Print all values of a configuration as YAML.
 

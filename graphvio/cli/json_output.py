@@ -16,7 +16,9 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-_OPTION = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")]
+from graphvio.cli import options
+
+_Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")]
 _results: ContextVar[list[object] | None] = ContextVar("results", default=None)
 
 
@@ -31,10 +33,11 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
     """Add ``--json`` to a command that publishes its result; its lines on stdout are then left out.
 
     A command that ends with an exit code of its own still prints the document; one that fails prints none.
+    ``--verbose`` is added, too, which `graphvio.cli.main` looks for.
     """
 
     @wraps(command)
-    def run(*, as_json: bool = False, **values: Any) -> None:
+    def run(*, verbose: bool = False, as_json: bool = False, **values: Any) -> None:
         if not as_json:
             command(**values)
             return
@@ -53,15 +56,18 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
         if code is not None:
             raise code
 
-    signature = inspect.signature(command)
-    option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_OPTION)
     hints = get_type_hints(command, include_extras=True)
+    added = {"verbose": options.Verbose, "as_json": _Json}
     parameters = [
         each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name])
-        for name, each in signature.parameters.items()
+        for name, each in inspect.signature(command).parameters.items()
     ]
-    run.__signature__ = signature.replace(parameters=[*parameters, option])  # type: ignore[attr-defined]
-    run.__annotations__ = {**hints, "as_json": _OPTION}
+    parameters += [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for name, kind in added.items()
+    ]
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {**hints, **added}
     return run
 
 

@@ -34,7 +34,6 @@ def live(
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
     forget_calibration: options.ForgetCalibration = False,
-    verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM, which leave a complete recording.
 

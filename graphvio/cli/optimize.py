@@ -52,7 +52,6 @@ def optimize(
     refine_calibration: options.RefineCalibration = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Optimise the trajectory of recorded sessions from all their measurements.
 

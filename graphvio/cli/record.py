@@ -39,7 +39,6 @@ def record(
     no_imu: options.NoImu = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry and record images, IMU, rig, poses and events as a session (MCAP, ROS 2 messages).
 
@@ -89,7 +88,6 @@ def convert(
     png: options.Png = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Write a recording in another format: MCAP, a ROS 1 or ROS 2 bag, or the EuRoC/ASL layout.
 

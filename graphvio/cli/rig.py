@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphvio.cli import options
 from graphvio.cli.json_output import publish
 
 if TYPE_CHECKING:
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 def rig(
     files: Annotated[list[Path], typer.Argument(help="Calibration file or recording; several are joined.")],
     out: Annotated[Path | None, typer.Option(help="Write the rig to this rig.yaml.")] = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Show a calibration as graphvio understands it, join those of several pairs, and write rig.yaml.
 

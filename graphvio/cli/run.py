@@ -43,7 +43,6 @@ def run(
     to_s: options.ToS = None,
     view: options.View = False,
     save_rrd: options.SaveRrd = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Estimate the trajectory of a recording.
 

@@ -36,7 +36,6 @@ def serve(
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
     forget_calibration: options.ForgetCalibration = False,
-    verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry on live sensors and serve estimates and keyframes by gRPC, ROS 2 topics and to browsers.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from graphvio.cli import completion, options
+from graphvio.cli import completion
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import ends_at_interrupt, framesets_bar
 
@@ -78,7 +78,6 @@ def simulate(
             autocompletion=completion.named_rig,
         ),
     ] = None,
-    verbose: options.Verbose = False,
 ) -> None:
     """Simulate a walk, drive or flight with cameras and an IMU, and write it in the EuRoC/ASL layout.
 

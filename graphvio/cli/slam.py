@@ -40,7 +40,6 @@ def slam(
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
     forget_calibration: options.ForgetCalibration = False,
-    verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry with a small SLAM system in a process of its own, which corrects the pose in the map.
 

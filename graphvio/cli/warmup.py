@@ -10,7 +10,7 @@ from graphvio.cli import options
 from graphvio.cli.json_output import publish
 
 
-def warmup(config: options.ConfigName = "default", verbose: options.Verbose = False) -> None:
+def warmup(config: options.ConfigName = "default") -> None:
     """Compile the numerical kernels for this machine, once: for images of machines and containers.
 
     The first command does so by itself. GRAPHVIO_CACHE_DIR names the folder of the compiled kernels.
