@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import reduce
 from operator import xor
 from typing import Any
@@ -105,20 +105,19 @@ class ImuLines:
 class SerialImu:
     """An IMU on a serial port as a `Device`, by pyserial.
 
-    Args:
-        path: of the port.
-        baud: rate of the port.
-        open_port: opens it by path and baud; None for pyserial.
-
     Raises:
         MissingExtraError: if pyserial is not installed.
     """
 
-    def __init__(self, path: str, baud: int, open_port: Callable[[str, int], Any] | None = None) -> None:
+    def __init__(self, path: str, baud: int) -> None:
+        try:
+            import serial
+        except ImportError:
+            raise MissingExtraError("pyserial", "live", "an IMU on a serial port") from None
+        self._library = serial
         self.name = f"serial:{path}"
         self.clock = self.name
         self._path, self._baud = path, baud
-        self._open_port = open_port or _pyserial()
         self._port: Any = None
         self._counts = Counts()
         self._lines = ImuLines(self.clock, self._counts)
@@ -127,7 +126,8 @@ class SerialImu:
         """See `Device.start`."""
         self._lines = ImuLines(self.clock, self._counts)
         try:
-            self._port = self._open_port(self._path, self._baud)
+            self._port = self._library.Serial(self._path, self._baud, timeout=_POLL_S, exclusive=True)
+            self._port.reset_input_buffer()  # arrival times of buffered data are meaningless
         except (OSError, ValueError) as error:
             raise SourceError(
                 f"{self._path}: cannot be opened as a serial port ({error}); check the cable, and that you are in "
@@ -161,17 +161,3 @@ class SerialImu:
     def counts(self) -> Mapping[str, int]:
         """See `Device.counts`."""
         return self._counts.totals()
-
-
-def _pyserial() -> Callable[[str, int], Any]:
-    try:
-        import serial
-    except ImportError:
-        raise MissingExtraError("pyserial", "live", "an IMU on a serial port") from None
-
-    def open_port(path: str, baud: int) -> Any:
-        port = serial.Serial(path, baud, timeout=_POLL_S, exclusive=True)
-        port.reset_input_buffer()  # arrival times of buffered data are meaningless
-        return port
-
-    return open_port
