@@ -72,8 +72,13 @@ def log_vision(odometry: Odometry) -> VisionLog:
     process, apply = odometry._frontend.process, odometry._estimator.apply
     vision_log = VisionLog({}, {})
 
-    def processed(frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None) -> VisualResult:
-        result = vision_log.results[frameset.stamp_ns] = process(frameset, predict, readout)
+    def processed(
+        frameset: FrameSet,
+        predict: MotionPredictor,
+        readout: ReadoutMotion | None = None,
+        turned: MotionPredictor | None = None,
+    ) -> VisualResult:
+        result = vision_log.results[frameset.stamp_ns] = process(frameset, predict, readout, turned)
         return result
 
     def applied(visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
