@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from calibration_walks import recorded, walk_simulator, with_wrong_place
 from real_clip import CLIP, real_clip
+from rendered import copy_part
 from typer.testing import CliRunner, Result
 from undrawn import undrawn
 
@@ -40,6 +41,7 @@ from graphvio.trajectory_files import load_trajectory
 
 pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
 SECONDS = 7.0
+ONCE_AND_AGAIN_S = 5.5  # of the walk, in which it comes by its first places again
 SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"
 ALWAYS_EQUAL = (
     "trajectory_optimized.txt",
@@ -66,6 +68,14 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def short_walk(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first part, for runs that close loops."""
+    folder = tmp_path_factory.mktemp("short") / "walk"
+    copy_part(walk, folder, ONCE_AND_AGAIN_S)
+    return folder
+
+
+@pytest.fixture(scope="module")
 def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("settings") / "settings.yaml"
     file.write_text(SETTINGS)
@@ -73,10 +83,10 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def done(walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(short_walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of an uninterrupted run."""
     out = tmp_path_factory.mktemp("results") / "walk"
-    finished = command(walk, "--config", settings, "--out", out)
+    finished = command(short_walk, "--config", settings, "--out", out)
     assert finished.exit_code == 0, finished.output
     return out
 
@@ -100,11 +110,11 @@ def test_optimize_rendered_walk_improves_on_online(done: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def of_one_camera(walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def of_one_camera(short_walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of the same walk by one camera and the IMU."""
     out = tmp_path_factory.mktemp("one-camera") / "walk"
     with undrawn():
-        finished = command(walk, "--cameras", "0", "--no-pairs", "--config", settings, "--out", out)
+        finished = command(short_walk, "--cameras", "0", "--no-pairs", "--config", settings, "--out", out)
     assert finished.exit_code == 0, finished.output
     return out
 
@@ -122,9 +132,11 @@ def test_optimize_one_camera_improves_on_online(of_one_camera: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_fleet_one_camera_equals_optimize(of_one_camera: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
+def test_fleet_one_camera_equals_optimize(
+    of_one_camera: Path, short_walk: Path, settings: Path, tmp_path: Path
+) -> None:
     listed, out = tmp_path / "list.txt", tmp_path / "out"
-    listed.write_text(f"{walk}\n")
+    listed.write_text(f"{short_walk}\n")
     arguments = [listed, "--cameras", "0", "--no-pairs", "--config", settings, "--workers", "1", "--out", out]
     finished = CliRunner().invoke(app, ["fleet", "optimize", *map(str, arguments)])
     assert finished.exit_code == 0, finished.output
@@ -133,9 +145,9 @@ def test_fleet_one_camera_equals_optimize(of_one_camera: Path, walk: Path, setti
 
 
 @pytest.mark.parametrize("with_loops", [False, True])
-def test_optimize_one_camera_is_consistent(of_one_camera: Path, walk: Path, with_loops: bool) -> None:
+def test_optimize_one_camera_is_consistent(of_one_camera: Path, short_walk: Path, with_loops: bool) -> None:
     """Where position and heading are those of the first state."""
-    source, record = open_source(walk), SessionRecord.load(of_one_camera / "walk/record.npz")
+    source, record = open_source(short_walk), SessionRecord.load(of_one_camera / "walk/record.npz")
     closures = load_closures(of_one_camera / "loops.npz") if with_loops else []
     (session,) = optimize([record], [source.rig.imu], closures, Config()).sessions
     assert source.truth is not None
@@ -203,9 +215,11 @@ def test_optimize_one_camera_writes_points_on_true_surfaces(of_one_camera: Path,
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_optimize_killed_run_continues_to_equal_results(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
+def test_optimize_killed_run_continues_to_equal_results(
+    short_walk: Path, settings: Path, done: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "walk"
-    line = [sys.executable, "-c", "from graphvio.cli import main; main()", "optimize", walk, "--config", settings]
+    line = [sys.executable, "-c", "from graphvio.cli import main; main()", "optimize", short_walk, "--config", settings]
     line += ["--out", out]
     process = subprocess.Popen([str(part) for part in line], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120.0
@@ -215,7 +229,7 @@ def test_optimize_killed_run_continues_to_equal_results(walk: Path, settings: Pa
     process.wait()
     finished = json.loads((out / "stages.json").read_text())["finished"]
     assert list(finished) == ["calibration of walk"]  # features are extracted while the odometry runs
-    assert command(walk, "--config", settings, "--out", out).exit_code == 0
+    assert command(short_walk, "--config", settings, "--out", out).exit_code == 0
     for name in ALWAYS_EQUAL:
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
 
@@ -232,33 +246,33 @@ def test_record_with_features_extracts_first_places(walk: Path, settings: Path, 
 
 
 def test_optimize_foreign_folder_is_refused_and_unchanged(
-    walk: Path, settings: Path, done: Path, tmp_path: Path
+    short_walk: Path, settings: Path, done: Path, tmp_path: Path
 ) -> None:
     before = {path: path.read_bytes() for path in done.rglob("*.txt")}
-    refused = command(walk, "--out", done)
+    refused = command(short_walk, "--out", done)
     assert isinstance(refused.exception, OptimizationError)
     assert "holds results of other input (different: config)" in str(refused.exception)
     assert {path: path.read_bytes() for path in done.rglob("*.txt")} == before
     (tmp_path / "mine.txt").write_text("mine")
-    refused = command(walk, "--config", settings, "--out", tmp_path)
+    refused = command(short_walk, "--config", settings, "--out", tmp_path)
     assert isinstance(refused.exception, OptimizationError)
     assert "is not empty" in str(refused.exception)
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_optimize_missing_files_are_written_again(done: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
+def test_optimize_missing_files_are_written_again(done: Path, short_walk: Path, settings: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk"
     shutil.copytree(done, out)
     for name in ("database.db", "walk/record.npz", "graph.g2o"):
         (out / name).unlink()
     shutil.rmtree(out / "colmap")
-    assert command(walk, "--config", settings, "--out", out).exit_code == 0
+    assert command(short_walk, "--config", settings, "--out", out).exit_code == 0
     for name in (*ALWAYS_EQUAL, "colmap/sparse/0/points3D.bin", "summary.json"):
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
 
 
-def test_optimize_exact_file_stays(walk: Path, done: Path) -> None:
-    used, of_file = load_rig(done / "walk/odometry/rig.yaml"), open_source(walk).rig
+def test_optimize_exact_file_stays(short_walk: Path, done: Path) -> None:
+    used, of_file = load_rig(done / "walk/odometry/rig.yaml"), open_source(short_walk).rig
     np.testing.assert_allclose(used.left2_T_left1(), of_file.left2_T_left1(), atol=1e-12)
     (found,) = json.loads((done / "summary.json").read_text())["sessions"][0]["calibration"]
     assert found.startswith("calibration: as in the rig file")
@@ -283,12 +297,12 @@ def test_optimize_wrong_file_is_calibrated_first(walk: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path, tmp_path: Path) -> None:
-    rig = open_source(walk).rig
+def test_optimize_refined_calibration_is_used_for_map(short_walk: Path, settings: Path, tmp_path: Path) -> None:
+    rig = open_source(short_walk).rig
     save_rig(with_wrong_place(rig, 1.0, 0.03), tmp_path / "wrong.yaml")
     out = tmp_path / "walk"
     refined = command(
-        walk, "--config", settings, "--rig", tmp_path / "wrong.yaml", "--refine-calibration", "--out", out
+        short_walk, "--config", settings, "--rig", tmp_path / "wrong.yaml", "--refine-calibration", "--out", out
     )
     assert refined.exit_code == 0, refined.output
     first = load_rig(out / "walk" / "rig-refined.yaml")
@@ -308,9 +322,9 @@ def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_optimize_sessions_overlapping_recordings_share_frame(walk: Path, tmp_path: Path) -> None:
+def test_optimize_sessions_overlapping_recordings_share_frame(short_walk: Path, tmp_path: Path) -> None:
     """Two parts of one recording that overlap by a second."""
-    sources = [open_source(walk, from_s=0.0, to_s=4.0), open_source(walk, from_s=3.0)]
+    sources = [open_source(short_walk, from_s=0.0, to_s=3.5), open_source(short_walk, from_s=2.5)]
     config = Config.from_yaml(SETTINGS + "calibration: {online: false}\n")  # other tests calibrate first
     found = optimize_sessions(sources, tmp_path / "both", config)
     assert found.frames == [0, 0]
