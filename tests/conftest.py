@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,10 @@ from hypothesis import settings
 
 # Fixtures import what they need: the process that hands out the tests needs none of it, and is waited for first.
 os.environ["MPLBACKEND"] = "Agg"
+
+# Else all sources are compiled again in each process of a command, and the tests in each run.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # The first example may compile or load kernels: no deadline. The same examples in each run.
 settings.register_profile("graphvio", deadline=None, derandomize=True)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from live_runs import SOON_S
 from recordings import write_euroc
+from rendered import rendered_once
 
 from graphvio import FrameSet, open_source
 from graphvio.errors import SourceError
@@ -32,11 +33,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def stationary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stationary() -> Path:
     """Half a second of the room, stationary."""
-    out = tmp_path_factory.mktemp("simulated") / "stationary"
-    simulate("room", out, duration_s=0.5, seed=3)
-    return out
+    return rendered_once("room", lambda folder: simulate("room", folder, duration_s=0.5, seed=3), "640x480", 0.5)
 
 
 def all_of(spec: str) -> list[Reading]:

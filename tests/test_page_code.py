@@ -268,7 +268,7 @@ def test_data_contract(session: Path, tmp_path: Path) -> None:
             shutil.rmtree(made)
         elif made is not None:
             made.unlink(missing_ok=True)
-        return [*arguments, "--duration", "1"] if arguments[0] == "simulate" else arguments
+        return [*arguments, "--duration", "0.5"] if arguments[0] == "simulate" else arguments
 
     for page in ("docs/reference/data-contract.md", "docs/reference/results.md", "docs/reference/simulation.md"):
         run_commands(page, tmp_path, made_again)
