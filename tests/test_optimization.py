@@ -38,8 +38,8 @@ CONFIG = Config()
 
 @pytest.fixture(scope="module")
 def walk() -> SyntheticSession:
-    """Two and a half laps with 40 closures, of which the last 12 are false."""
-    return make_session(225.0, 1, IMU, 40, 0.3)
+    """A lap and two thirds with 40 closures, of which the last 12 are false."""
+    return make_session(150.0, 1, IMU, 40, 0.3)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def broken(session: SyntheticSession, row: int) -> SessionRecord:
 
 
 def test_optimize_epochs_are_joined_by_closures_only(walk: SyntheticSession) -> None:
-    record = broken(walk, 3000)
+    record = broken(walk, 2000)
     found = optimize([record], [IMU], walk.closures, CONFIG)
     assert found.frames == [0, 0]
     assert ate_m(found.sessions[0].nav_T_body, walk) < 0.1

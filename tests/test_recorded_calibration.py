@@ -117,7 +117,7 @@ def test_calibrate_recording_of_single_cameras_finds_lenses_and_places(walk: Pat
     written = draw(
         true, CalibrationErrors.of_level(2, ["principal-point", "cameras-in-body", "time-offset"]), 1
     ).written_rig
-    found = calibrate_recording(open_source(walk, written), written)
+    found = calibrate_recording(open_source(walk, written, to_s=9.0), written)
     before, after = rms(written, true), rms(found.rig, true)
     for name, share in (("principal_point_px", 0.8), ("cameras_in_body_deg", 0.5)):
         assert after[name] < share * before[name], name
