@@ -200,7 +200,7 @@ def test_two_realsense(session: Path, tmp_path: Path) -> None:
     assert (tmp_path / "calibration/report.html").exists()
 
 
-FAST = "replay:walk.mcap?speed=2&to_s=4"  # less to wait for than for a sensor
+FAST = "replay:walk.mcap?speed=2&to_s=3"  # less to wait for than for a sensor
 
 
 def test_slam(room_walk: Path, tmp_path: Path) -> None:
