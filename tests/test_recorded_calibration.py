@@ -96,7 +96,7 @@ def test_halves_of_one_rig_agree_and_those_of_two_do_not() -> None:
 
 
 def test_calibrate_recording_finds_all_parameters(walk: Path) -> None:
-    source, true = open_source(walk), load_rig(walk)
+    source, true = open_source(walk, to_s=9.0), load_rig(walk)
     written = draw(true, CalibrationErrors.of_level(2, [*OF_CAMERAS, "cameras-in-body"]), 1).written_rig
     found = calibrate_recording(source, written)
     before, after = rms(written, true), rms(found.rig, true)
