@@ -299,6 +299,8 @@ def test_run_invalid_options_exit_with_2(room_walk: Path, tmp_path: Path) -> Non
     assert "did you mean 'cauchy_scale_px'" in refused(graphvio("run", room_walk, "--config", tmp_path / "typo.yaml"))
     assert "no pair 7" in refused(graphvio("run", room_walk, "--pairs", "0,7"))
     assert "give numbers" in refused(graphvio("run", room_walk, "--pairs", "front"))
+    assert "give numbers" in refused(graphvio("run", room_walk, "--pairs", "", "--no-imu"))  # an unset variable
+    assert "there is no camera ''" in refused(graphvio("run", room_walk, "--cameras", ""))
     (tmp_path / "full").mkdir()
     (tmp_path / "full/thesis.tex").write_text("do not overwrite")
     assert "not empty" in refused(graphvio("run", room_walk, "--out", tmp_path / "full", "--to", 0.2))

@@ -110,10 +110,10 @@ def reading_of(
     from graphvio.sources.reading import Reading
 
     try:
-        numbers = tuple(int(each) for each in pairs.split(",")) if pairs else None
+        numbers = None if pairs is None else tuple(int(each) for each in pairs.split(","))
     except ValueError:
-        raise RigError(f"--pairs {pairs}: give numbers separated by commas, such as 0,1") from None
-    names = tuple(name.strip() for name in cameras.split(",")) if cameras else None
+        raise RigError(f"--pairs {pairs!r}: give numbers separated by commas, such as 0,1") from None
+    names = None if cameras is None else tuple(name.strip() for name in cameras.split(","))
     mapped = [each.split("=") for each in (topics or "").split(",") if each]
     if any(len(pair) != 2 or not all(pair) for pair in mapped):
         raise SourceError(f"--topics {topics}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
