@@ -13,7 +13,7 @@ from graphvio.sources.recording import Source
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read of each recording, as by the options of ``graphvio optimize``."""
+    """What is read of each recording, as the options of a command say."""
 
     pairs: tuple[int, ...] | None = None  # numbers of the stereo pairs; None for all
     cameras: tuple[str, ...] | None = None  # names of the cameras; None for all
