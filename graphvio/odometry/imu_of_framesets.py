@@ -10,9 +10,10 @@ from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
 from graphvio.backend.initialisation import shows_standstill
 from graphvio.backend.smoother_estimator import SmootherEstimator
+from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.frontend.rolling_shutter import ReadoutMotion
-from graphvio.geometry import se3, so3_exp
+from graphvio.geometry import se3
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion, VisualResult
@@ -57,7 +58,6 @@ class ImuOfFramesets:
             self._clock_watch = ClockWatch(rig, self._clock, synchroniser)
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._first_ns: int | None = None
-        self._newest: tuple[int, ImuInterval] | None = None  # where the newest interval began
 
     @property
     def is_left_out(self) -> bool:
@@ -124,13 +124,10 @@ class ImuOfFramesets:
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Return the IMU between two framesets, or None where it does not cover them, or is left out."""
-        self._newest = None
         if not self._estimator.has_imu or self.is_left_out:
             return None
         interval = self._synchroniser.interval(start_ns, end_ns)
-        if interval is not None:
-            self._newest = start_ns, interval
-        else:
+        if interval is None:
             self._report(
                 end_ns,
                 EventKind.IMU_NOT_COVERING,
@@ -139,17 +136,17 @@ class ImuOfFramesets:
         return interval
 
     def turned_since(self, then_ns: int) -> Float | None:
-        """Return ``now_T_then`` (4, 4) of body since the frameset before, by the gyro alone and without translation.
+        """Return ``now_T_then`` (4, 4) of body from a frameset to the newest one, by the gyro and without translation.
 
-        It is what can be predicted while single cameras have no pose; None of other instants, and if the gyro is
-        doubted.
+        It is what can be predicted while single cameras have no pose; None once they have, and if the gyro is doubted.
         """
         is_doubted = self._clock_watch is not None and self._clock_watch.is_doubted
-        if self._newest is None or self._newest[0] != then_ns or is_doubted:
+        if self._estimator.has_pose or not self._estimator.has_imu or is_doubted:
             return None
-        interval, then_R_now = self._newest[1], np.eye(3)
-        for rotation_vector in interval.steps_s[:, None] * interval.angular_velocity:
-            then_R_now = then_R_now @ so3_exp(rotation_vector)
+        interval = self._synchroniser.interval(then_ns, self._estimator.latest_ns)
+        if interval is None:
+            return None
+        then_R_now, _ = integrated_rates(interval.steps_s, interval.angular_velocity)
         return se3(np.ascontiguousarray(then_R_now.T), np.zeros(3))
 
     def readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
