@@ -228,9 +228,7 @@ def _print_result(found: Calibration) -> None:
     from rich.console import Console
 
     from graphvio.calibration.pair_calibration import size_in_words
-    from graphvio.calibration.report.document import document
 
-    publish(document(found))
     Console(soft_wrap=True).print(_table(found))
     for (i, j), each in found.places.pairwise.items():
         errors = each.frame_errors_m if len(each.frames) else each.alignment_errors_m
@@ -279,7 +277,10 @@ def _with_sigma(value: float, sigma: float, known: bool) -> str:
 
 
 def _finish(found: Calibration, report: Path | None, source: str, count: int) -> None:
-    """Write the report if it is asked for, and say by the exit code whether all was found."""
+    """Publish what was found, write the report if it is asked for, and say by the exit code whether it is all."""
+    from graphvio.calibration.report.document import document
+
+    publish(document(found))
     if report is not None:
         from graphvio.calibration.report.page import write_report
 

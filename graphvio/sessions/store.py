@@ -23,7 +23,11 @@ class Store(ABC):
 
     @abstractmethod
     def read(self, place: Place) -> bytes:
-        """See `graphvio.sessions.topics.MessageReader`."""
+        """Return a message as CDR.
+
+        Raises:
+            SessionError: if it is damaged.
+        """
 
     @property
     def damaged_chunks(self) -> int:

@@ -42,7 +42,14 @@ class ImageFiles:
     names: Sequence[str]  # of the files
 
     def read(self, row: int) -> Image:
-        """See `ImageSequence.read`."""
+        """Return the image of a row, (height, width) uint8; from any thread.
+
+        Args:
+            row: index of its stamp.
+
+        Raises:
+            ImageError: if it is missing or damaged.
+        """
         return read_grey(self.folder / self.names[row])
 
 

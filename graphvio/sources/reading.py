@@ -31,7 +31,18 @@ class Reading:
         return rig if self.with_imu else rig.without_imu()
 
     def open(self, path: Path, rig: Rig | None, tolerance_ms: float | None) -> Source:
-        """Open a recording; see `open_source`."""
+        """Open what is read of a recording.
+
+        Args:
+            path: folder of the recording, or file of a session or bag.
+            rig: of the whole recording; None takes the recording's own.
+            tolerance_ms: within which images are of one instant, see `open_source`.
+
+        Raises:
+            SourceError: if it cannot be read, has no known layout, or holds nothing in the given time.
+            RigError: if there is no rig, or it has no such pairs or cameras.
+            SessionError: if a session or bag cannot be read.
+        """
 
         def opened(of: Rig | None) -> Source:
             topics = dict(self.topics)

@@ -105,6 +105,10 @@ class ImuLines:
 class SerialImu:
     """An IMU on a serial port as a `Device`, by pyserial.
 
+    Args:
+        path: of the port.
+        baud: rate of the port.
+
     Raises:
         MissingExtraError: if pyserial is not installed.
     """
