@@ -8,6 +8,7 @@ from statistics import median
 
 import numpy as np
 
+from benchmarks.command_line import add_report_options
 from benchmarks.recordings import add_data_option, rendered_once
 from benchmarks.report import Report, machine
 from graphvio.arrays import Float
@@ -54,8 +55,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
     parser.add_argument("--duration", type=float, metavar="S", help="only so much of each walk")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="also write the tables to this file")
-    parser.add_argument("--docs", action="store_true", help="put the tables into docs/explanation/benchmarks")
+    add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.command_line import add_report_options
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine
 from graphvio.arrays import AnyArray
@@ -30,8 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--recording", type=Path, metavar="DIR", help="of this recording (default: a simulated room)")
     parser.add_argument("--images", type=int, default=200, metavar="N", help="images of each round (default: 200)")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report there, too")
-    parser.add_argument("--docs", action="store_true", help="put the report into docs")
+    add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=run)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.command_line import add_command
+from benchmarks.command_line import add_command, add_report_options
 from benchmarks.fault_cases import CASES, WALKS, Case, hard_measurements
 from benchmarks.fault_outcomes import MATERIAL_DEG, MATERIAL_M, MotionOutcome, Outcome, Run
 from benchmarks.fault_scenes import CORRIDOR_S, recording
@@ -64,10 +64,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--cases", nargs="+", metavar="CASE", choices=[c.name for c in CASES], help="only these")
     parser.add_argument("--pairs", type=int, nargs="+", metavar="PAIR", help="only these pairs of the rig")
     parser.add_argument("--jobs", type=int, default=1, help="cases that are run side by side (default: 1)")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    add_report_options(parser)
     parser.add_argument("--motions", type=Path, metavar="FILE.csv", help="write a line for each motion")
     parser.add_argument("--config", metavar="NAME", help="profile or YAML file to run with (default: the defaults)")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/explanation/benchmarks")
     add_data_option(parser)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.backend import AIM_MS as BACKEND_AIM_MS
 from benchmarks.backend import AIM_P99_MS as BACKEND_AIM_P99_MS
+from benchmarks.command_line import add_report_options
 from benchmarks.growth import add_growth
 from benchmarks.recordings import Footage, add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine
@@ -67,8 +68,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--no-growth", action="store_true", help="leave out the tables of growth")
     parser.add_argument("--profile", default="default", metavar="NAME", help="configuration, by name or YAML file")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report there, too")
-    parser.add_argument("--docs", action="store_true", help="put the report into docs/explanation/benchmarks")
+    add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=run)
 

@@ -6,12 +6,12 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 
 import numpy as np
 
 from benchmarks.cameras import ate_mm
+from benchmarks.command_line import add_report_options
 from benchmarks.recordings import add_data_option, rendered_once
 from benchmarks.report import Report, log_progress, machine
 from graphvio.cameras import MODEL_NAMES, distort
@@ -54,8 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
     parser.add_argument("--duration", type=float, default=16.0, metavar="S", help="of each walk (default: 16)")
     parser.add_argument("--lenses", nargs="*", default=list(_LENSES), choices=list(_LENSES), metavar="NAME")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="also write the tables to this file")
-    parser.add_argument("--docs", action="store_true", help="put the tables into docs/explanation/benchmarks")
+    add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from benchmarks.command_line import add_report_options
 from benchmarks.recordings import Footage, add_data_option, simulated
 from benchmarks.report import IMAGES, Report, log_progress, machine, writing
 from benchmarks.timing import WARM_UP
@@ -36,8 +37,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--recording", type=Path, metavar="DIR", help="of this recording (default: a simulated room)")
     parser.add_argument("--framesets", type=int, default=200, metavar="N", help="counted framesets (default: 200)")
     parser.add_argument("--profile", default="default", metavar="NAME", help="configuration, by name or YAML file")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report there, too")
-    parser.add_argument("--docs", action="store_true", help="put report and picture into docs")
+    add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=run)
 
