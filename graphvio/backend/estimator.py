@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from graphvio.arrays import Float, Int
+from graphvio.backend.imu_match import ImuMatch
 from graphvio.backend.states import RigState, StateCovariance
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.gate_result import GateResult
@@ -157,3 +158,32 @@ class StateEstimator(Protocol):
 
     def finish(self) -> None:
         """Declare all poses final: no measurement follows."""
+
+
+@runtime_checkable
+class ImuFaultTolerant(Protocol):
+    """What a `StateEstimator` has in addition, if it can go on by vision alone while the IMU contradicts vision.
+
+    The odometry watches the IMU of an estimator that has these methods, see `graphvio.odometry.imu_watch`, and the
+    self-calibration reports wrong corrections of the IMU to it.
+    """
+
+    def leave_imu_out(self) -> None:
+        """Stop using the IMU until `use_imu_again`; the initialisation no longer waits for what the IMU shows."""
+
+    def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
+        """Use the IMU again: keep the newest pose, and take biases and gravity from a comparison with vision.
+
+        Args:
+            motion: By vision, that ends in the newest state.
+            match: How the IMU moves beside vision.
+        """
+
+    def distrust_prediction(self) -> None:
+        """Take the refused motions for right and the prediction for wrong: the IMU's calibration has been corrected.
+
+        Biases and attitude have followed wrong samples, so that the next reinitialisation gives them wide priors.
+        """
+
+    def pose_by_vision(self) -> Float:
+        """Return ``nav_T_body`` (4, 4) of the newest state; while motions are refused, the one that they lead to."""

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.estimator import StateEstimator
+from graphvio.backend.estimator import ImuFaultTolerant, StateEstimator
 from graphvio.backend.initialisation import shows_standstill
-from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.frontend.rolling_shutter import ReadoutMotion
@@ -52,7 +51,7 @@ class ImuOfFramesets:
         self._clock = ImuClock(config.timing.max_imu_wait_ms * 1e-3, synchroniser, report)
         self._watch: ImuWatch | None = None
         self._clock_watch: ClockWatch | None = None
-        if rig.imu is not None and isinstance(estimator, SmootherEstimator):
+        if rig.imu is not None and isinstance(estimator, ImuFaultTolerant):
             self._watch = ImuWatch(config.smoother.max_gated_s, self._clock, synchroniser, report)
         elif isinstance(estimator, MonocularEstimator):
             self._clock_watch = ClockWatch(rig, self._clock, synchroniser)
@@ -97,7 +96,7 @@ class ImuOfFramesets:
             return is_corrected
         if self._watch is None:
             return False
-        assert isinstance(self._estimator, SmootherEstimator)
+        assert isinstance(self._estimator, ImuFaultTolerant)
         was_left_out = self.is_left_out
         gate_result = None if interval is None else self._estimator.gate_results.get("vision")
         match = self._watch.update(stamp_ns, visual, gate_result, is_applied=applied is not None)

@@ -307,9 +307,7 @@ class Odometry:
         """Predict the state, measure the motion, gate it, update, recalibrate, and publish (sections 3 and 5)."""
         self.stage_ms = {}
         if self._imu.is_awaited(frameset.stamp_ns):
-            visual = self._frontend.process(frameset, self._estimator.motion_since)
-            self.stage_ms.update(visual.stage_ms)
-            return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
+            return self._track_without_state(frameset)
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu.shows_standstill(predicted.interval)
@@ -320,6 +318,12 @@ class Odometry:
         if not self._estimator.has_pose:
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
         return self._publish(frameset, predicted, visual, is_stationary, applied, status)
+
+    def _track_without_state(self, frameset: FrameSet) -> Estimate:
+        """Track the corners while the state cannot be initialised, since the IMU's first sample is awaited."""
+        visual = self._frontend.process(frameset, self._estimator.motion_since)
+        self.stage_ms.update(visual.stage_ms)
+        return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
 
     @timed("predict")
     def _predict(self, stamp_ns: int) -> _Predicted:

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.estimator import StateEstimator
-from graphvio.backend.smoother_estimator import SmootherEstimator
+from graphvio.backend.estimator import ImuFaultTolerant, StateEstimator
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import so3_log
@@ -59,7 +58,7 @@ class PairsCalibration:
         self._frontend = frontend
         self._synchroniser = synchroniser
         self._estimator = estimator
-        self._smoother = estimator if isinstance(estimator, SmootherEstimator) else None
+        self._imu_fault_tolerant = estimator if isinstance(estimator, ImuFaultTolerant) else None
         self._report = report
         self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
         self._mean_force: Float = np.zeros(3)  # of the first samples
@@ -119,7 +118,8 @@ class PairsCalibration:
             self._epoch = estimator.epoch
             calibration.start_window()
         views = views_at(self._frontend, stamp_ns)
-        pose = estimator.state().nav_T_body if self._smoother is None else self._smoother.pose_by_vision()
+        tolerant = self._imu_fault_tolerant
+        pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)
         calibration.add_frameset(stamp_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
@@ -141,8 +141,9 @@ class PairsCalibration:
         self._in_force = self.estimate.difference
         if self._allowance is not None and self._allowance.recalibrate(change[:n]):
             self._frontend.start_keyframe()
-        if self._smoother is not None and (np.abs(change) > _DISTRUST_SIGMAS * self.estimate.sigmas)[n:].any():
-            self._smoother.distrust_prediction()
+        is_imu_changed = bool((np.abs(change) > _DISTRUST_SIGMAS * self.estimate.sigmas)[n:].any())
+        if is_imu_changed and self._imu_fault_tolerant is not None:
+            self._imu_fault_tolerant.distrust_prediction()
         self._correct_imu()
         return self._turn()
 
