@@ -253,22 +253,30 @@ class SmootherEstimator:
         self.gate_results["vision"] = gate_result
         excess = smoother.excess_acceleration(motion)
         if gate_result.accepted and excess is None:
-            if motion.reference_stamp_ns in self._refused:
-                # It agrees with the prediction only because both start from a state that vision did not constrain.
-                self._add_refused(motion)
-                if self._is_distrusted or self._imu_failed:
-                    self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
-                else:
-                    self._reinitialise_from_prediction(motion)
-                return MeasurementUpdate(motion, needs_keyframe=True)
-            smoother.add_motion(motion)
-            self._accepted += 1
-            self._note_accepted()
-            return MeasurementUpdate(motion)
+            return self._accept(motion)
         why = _exceedance(gate_result) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
         if visual.quality is not Quality.GOOD:
             return MeasurementUpdate(None)  # vision that contradicts itself cannot refute the prediction
+        return self._refuse(motion)
+
+    def _accept(self, motion: RelativeMotion) -> MeasurementUpdate:
+        """Insert a motion that passes the gate; reinitialise if it begins at a state whose own motion was refused."""
+        if motion.reference_stamp_ns not in self._refused:
+            self._running.add_motion(motion)
+            self._accepted += 1
+            self._note_accepted()
+            return MeasurementUpdate(motion)
+        # It agrees with the prediction only because both start from a state that vision did not constrain.
+        self._add_refused(motion)
+        if self._is_distrusted or self._imu_failed:
+            self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
+        else:
+            self._reinitialise_from_prediction(motion)
+        return MeasurementUpdate(motion, needs_keyframe=True)
+
+    def _refuse(self, motion: RelativeMotion) -> MeasurementUpdate:
+        """Leave a motion of good quality out; reinitialise from vision once it has been refused for too long."""
         self._add_refused(motion)
         if self._is_distrusted:
             self._reinitialise_from_vision(motion, "the IMU was corrected wrongly while vision was refused")

@@ -312,7 +312,8 @@ class Odometry:
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu.shows_standstill(predicted.interval)
         applied = self._gate(visual, is_stationary)
-        status = self._update(predicted, visual, applied)
+        status = self._update(predicted, applied)
+        self._watch_imu(predicted, visual, applied)
         self._recalibrate(frameset.stamp_ns, visual, status)
         self._restart_prediction(frameset.stamp_ns, status)
         if not self._estimator.has_pose:
@@ -355,24 +356,28 @@ class Odometry:
         return applied
 
     @timed("update")
-    def _update(self, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate) -> Status:
-        """Solve for the state, and let the time offset follow."""
-        stamp_ns = predicted.stamp_ns
+    def _update(self, predicted: _Predicted, applied: MeasurementUpdate) -> Status:
+        """Solve for the state, and drop the tracks that it shows to move."""
         previous_keyframe = set() if self._keyframe_ns is None else {self._keyframe_ns}
         update = self._estimator.update(
-            stamp_ns,
+            predicted.stamp_ns,
             is_constrained=predicted.is_initial or applied.motion is not None,
             keep=self._frontend.reference_stamps_ns | previous_keyframe,
         )
         if update.needs_keyframe:
             self._frontend.start_keyframe()
         self._frontend.drop(update.outliers)
+        return update.status
+
+    @timed("update")
+    def _watch_imu(self, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate) -> None:
+        """Leave the IMU out while it contradicts vision, and let the time offset follow."""
+        stamp_ns = predicted.stamp_ns
         if self._imu.watch(stamp_ns, predicted.interval, visual, applied.motion):
             self._frontend.start_keyframe()
             self._calibration.restart_imu()
         self._synchroniser.forget_before(stamp_ns)
         self._time_offset.update(stamp_ns, visual)
-        return update.status
 
     def _recalibrate(self, stamp_ns: int, visual: VisualResult, status: Status) -> None:
         """Let the calibration take what the cameras see, and use the one that comes into force."""
