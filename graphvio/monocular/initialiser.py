@@ -7,8 +7,9 @@ those that the noise accounts for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
-from graphvio.monocular.sightings import LandmarkNames, Landmarks, far_off
+from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
 from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import located
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, Window
@@ -46,6 +47,12 @@ _FIRST_DOUBT = 3  # windows that fit no motion with an exact file, until that is
 _OTHER_SCALES = (0.6, 1.7)
 _MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
 POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
+
+
+class _Keyframe(NamedTuple):
+    stamp_ns: int
+    sightings: Mapping[int, Sighting]
+    is_stationary: bool
 
 
 class Initialiser:
@@ -73,7 +80,7 @@ class Initialiser:
         self._sigma_px = sigma_px
         self._doubts_file = doubts_file
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
-        self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
+        self._keyframes: list[_Keyframe] = []
         self._fits_no_motion = False  # the window that was tested last
         self._is_file_doubted, self._keyframes_in_doubt = False, 0  # by a window that fits; until the scale is known
         self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows
@@ -87,17 +94,17 @@ class Initialiser:
     @property
     def oldest_ns(self) -> int | None:
         """Stamp of the first keyframe, or None."""
-        return self._keyframes[0][0] if self._keyframes else None
+        return self._keyframes[0].stamp_ns if self._keyframes else None
 
     def add(self, stamp_ns: int, sightings: Mapping[int, Sighting], is_stationary: bool) -> Window | None:
         """Take a keyframe, and return the window if its scale is known."""
-        if is_stationary and self._keyframes and self._keyframes[-1][2]:
+        if is_stationary and self._keyframes and self._keyframes[-1].is_stationary:
             self._keyframes.pop()  # of a standstill the newest keyframe stays
-        self._keyframes.append((stamp_ns, sightings, is_stationary))
+        self._keyframes.append(_Keyframe(stamp_ns, sightings, is_stationary))
         del self._keyframes[:-MAX_KEYFRAMES]
-        while stamp_ns - self._keyframes[0][0] > MAX_DURATION_NS:
+        while stamp_ns - self._keyframes[0].stamp_ns > MAX_DURATION_NS:
             del self._keyframes[0]
-        duration_s = (stamp_ns - self._keyframes[0][0]) * 1e-9
+        duration_s = (stamp_ns - self._keyframes[0].stamp_ns) * 1e-9
         is_metric = shared_points(sightings) >= _MIN_LANDMARKS
         min_keyframes = _MIN_METRIC_KEYFRAMES if is_metric else _MIN_KEYFRAMES
         min_duration_s = _MIN_METRIC_DURATION_S if is_metric else _MIN_DURATION_S
@@ -130,30 +137,18 @@ class Initialiser:
         """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
         self._fits_no_motion = False
         file = self._calibration.file(factors)
-        keyframes = self._keyframes
-        samples = self._samples_of(np.array([stamp for stamp, _, _ in keyframes]), file is None)
-        if file is not None:  # where samples begin too late for some time offsets, these would be out of reach
-            since_ns = samples.stamps_ns[0] + MAX_TIME_OFFSET_NS
-            keyframes = [keyframe for keyframe in keyframes if keyframe[0] >= since_ns]
-        stamps = np.array([stamp for stamp, _, _ in keyframes])
-        samples = samples._replace(keyframes_ns=stamps)
-        names, landmarks = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1), Landmarks()
+        keyframes, samples = self._covered_keyframes(file)
+        names = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1)
         views = []
-        for _, sightings, _ in keyframes:
-            views.append(names.join(sightings))
+        for keyframe in keyframes:
+            views.append(names.join(keyframe.sightings))
             names.note_keyframe()
-        n = len(stamps)
-        structure, _, ids = landmarks.structure(views, np.tile(np.eye(4), (n, 1, 1)), self._cameras)
-        if len(ids) < _MIN_LANDMARKS:
-            self.reason = f"only {len(ids)} points stay in view"
+        states = self._first_states(samples, views, file)
+        if states is None:
             return None
-        guess = first_guess(samples, structure, self._cameras, self._gyro_bias)
-        biases = np.concatenate([guess.gyro_bias, np.zeros(3)])
-        calibration = np.zeros(self._calibration.size) if file is None else file.mean
-        states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases, calibration)
         bias_sigmas = np.repeat([self._gyro_bias_sigma, ACCEL_BIAS_SIGMA], 3)
         prior = first_prior(states, bias_sigmas, np.concatenate([self._gyro_bias, np.zeros(3)]), POSE_SIGMAS)
-        stationary = np.flatnonzero([still for _, _, still in keyframes])
+        stationary = np.flatnonzero([keyframe.is_stationary for keyframe in keyframes])
         landmarks = Landmarks()
         fitting = 1.0
         for is_first in (True, False):
@@ -166,12 +161,7 @@ class Initialiser:
             places = located(states.poses, cameras, places, structure, self._sigma_px, True)
             measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
             if file is not None and is_first:
-                # By the rig file, points are off by pixels: they are not distinguished from mismatches yet.
-                rough = adjust(
-                    measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file
-                )
-                states, places = rough.states, rough.landmarks
-                measured = measured._replace(structure=rough.measured.structure)
+                measured, states, places = self._roughly_adjusted(measured, states, places, prior, file)
             adjusted = adjust(measured, states, places, prior, _STEPS, file)
             states = adjusted.states
             landmarks.put(adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
@@ -189,8 +179,36 @@ class Initialiser:
             self._fits_no_motion = self._is_file_doubted = True
             self.reason = "images and IMU contradict the rig file"
             return None
-        still = [k in stationary for k in range(n)]
+        still = [keyframe.is_stationary for keyframe in keyframes]
         return self._in_nav(Window(states, views, still, names, landmarks, prior, factors))
+
+    def _covered_keyframes(self, file: Gaussian | None) -> tuple[list[_Keyframe], InertialSamples]:
+        """Return the keyframes that the IMU covers whatever its time offset may be, and its samples."""
+        keyframes = self._keyframes
+        samples = self._samples_of(np.array([keyframe.stamp_ns for keyframe in keyframes]), file is None)
+        if file is not None:  # where samples begin too late for some time offsets, these would be out of reach
+            since_ns = samples.stamps_ns[0] + MAX_TIME_OFFSET_NS
+            keyframes = [keyframe for keyframe in keyframes if keyframe.stamp_ns >= since_ns]
+        return keyframes, samples._replace(keyframes_ns=np.array([keyframe.stamp_ns for keyframe in keyframes]))
+
+    def _first_states(self, samples: InertialSamples, views: Sequence[Views], file: Gaussian | None) -> States | None:
+        """Guess the states of the keyframes in closed form, or return None where too few points stay in view."""
+        poses = np.tile(np.eye(4), (len(views), 1, 1))
+        structure, _, ids = Landmarks().structure(views, poses, self._cameras)
+        if len(ids) < _MIN_LANDMARKS:
+            self.reason = f"only {len(ids)} points stay in view"
+            return None
+        guess = first_guess(samples, structure, self._cameras, self._gyro_bias)
+        biases = np.concatenate([guess.gyro_bias, np.zeros(3)])
+        calibration = np.zeros(self._calibration.size) if file is None else file.mean
+        return States(samples.keyframes_ns, guess.poses, guess.velocities, guess.gravity, biases, calibration)
+
+    def _roughly_adjusted(
+        self, measured: Measurements, states: States, places: Float, prior: Prior, file: Gaussian
+    ) -> tuple[Measurements, States, Float]:
+        """Adjust as if corners were known badly: by the rig file they are off by pixels, and not yet mismatches."""
+        rough = adjust(measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file)
+        return measured._replace(structure=rough.measured.structure), rough.states, rough.landmarks
 
     def _fault(self, adjusted: Adjusted, fitting: float, factors: Float) -> str:
         """Say why a window is not accepted, or nothing; a rig file that is wrong by factors understates noise, too."""
