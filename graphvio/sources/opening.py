@@ -118,7 +118,7 @@ def layout_of(path: Path) -> Layout:
 
 
 def _layouts() -> Iterator[Layout]:
-    """Yield all layouts, own ones first: plug-ins are loaded where none of these matches."""
+    """Yield all layouts, built-in ones first: plug-ins are loaded where none of these matches."""
     yield from _LAYOUTS
     yield from plug_ins().layouts
 
