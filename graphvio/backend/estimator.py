@@ -1,4 +1,7 @@
-"""What a state estimator does for the odometry, whether it is the smoother or the paper's filter."""
+"""The interface of a state estimator, as the odometry uses it.
+
+`SmootherEstimator` and `FilterEstimator` implement it, and without stereo pairs `MonocularEstimator`.
+"""
 
 from __future__ import annotations
 
