@@ -82,7 +82,9 @@ def _length_error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: l
 def constant_velocity(
     i: int, j: int, motion: Float, dt: float, after_s: float, rate_sigmas: Float, accel_sigmas: Float
 ) -> gtsam.NonlinearFactor:
-    """Predict constant velocity and angular rate up to white accelerations (eq. 11 and 12).
+    """Return a factor of constant velocity and angular rate between two states (eq. 11 and 12).
+
+    Its noise is that of unknown accelerations that stay constant since the motion was last measured.
 
     Args:
         i: a state.
@@ -102,7 +104,10 @@ def constant_velocity(
 def imu_without_samples(
     i: int, j: int, dt: float, accel_sigma_m_s2: float, imu: Imu, noise_scale: float
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield factors of a constant velocity up to white accelerations, and of the biases' random walk."""
+    """Yield factors of a constant velocity and of the biases' random walk.
+
+    The velocity's noise is that of an unknown acceleration which is constant within the step.
+    """
     yield gtsam.BetweenFactorVector(v(i), v(j), np.zeros(3), isotropic(3, accel_sigma_m_s2 * dt))
     walk = noise_scale * np.sqrt(dt)
     sigmas = np.repeat([walk * imu.accel_random_walk, walk * imu.gyro_random_walk], 3)

@@ -1,7 +1,8 @@
 """A fixed-lag smoother over poses, velocities and IMU biases at frameset times (section 5).
 
-It has the semantics of the paper's filter. `extend` predicts, from the IMU or by constant velocity (eq. 11); `gate`
-tests the innovation of a relative motion; `add_motion` and `update` are the measurement update; `initialise` resets.
+Its calls mirror a filter's. `extend` predicts, from the IMU or by constant velocity (eq. 11); `gate` tests the
+innovation of a relative motion; `add_motion` and `update` are the measurement update; `initialise` resets. Its model is
+preintegration, not eq. (13).
 """
 
 from __future__ import annotations

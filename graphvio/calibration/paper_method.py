@@ -127,8 +127,8 @@ def translations(R: Float, parts: PoseParts, noise_rad: float) -> Float:
 def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
     """Compute alignment errors (N, 3), eq. (7), metres.
 
-    Each is the distance between the second camera's centres by both cameras' motions, in the frame of the first camera
-    at the start; ``t = -R^T T`` is that centre in the first camera's frame.
+    Each is the vector between the centres of the second camera at the end of a motion, as both cameras' motions predict
+    it, in the frame of the first camera at the beginning; ``t = -R^T T`` is that centre in the first camera's frame.
     """
     by_2 = np.einsum("ji,nkj,nk->ni", R, parts.R_2, parts.T_2)
     by_1 = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)

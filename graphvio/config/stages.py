@@ -70,7 +70,8 @@ class MotionConfig(Stage):
     reference: Literal["previous", "keyframe"] = "keyframe"
     """Motion is measured from the previous frameset, or from one that stays while enough of it is in view."""
     keyframe_overlap: float = 0.7
-    """Share of a keyframe's points that must still be tracked for it to stay."""
+    """A new keyframe begins where fewer than this share of the keyframe's points with depth are inliers of the motion;
+    other criteria are in ``ReferenceThresholds``."""
     hypotheses: int = 500
     """Maximum number of 3-point hypotheses of each pair."""
     confidence: float = 0.99999

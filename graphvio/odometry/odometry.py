@@ -1,4 +1,6 @@
-"""The odometry: IMU samples and framesets in, estimates out; the algorithm of the paper, without I/O."""
+"""The odometry: IMU samples and framesets in, estimates out, without I/O.
+
+The main loop has the structure of the paper's figure 3; each of its stages may differ from the paper's."""
 
 from __future__ import annotations
 
@@ -80,7 +82,8 @@ def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | Filte
 class Odometry:
     """Visual-inertial odometry of a rig of stereo pairs and single cameras.
 
-    Feed measurements in time order with `process`. A frameset is held until the IMU samples that cover it have come.
+    Feed measurements in time order with `process`. A frameset is held until the IMU samples that cover it have come; at
+    the end, `finish` returns the estimates of those that are still held.
 
     Args:
         rig: Cameras and IMU; without an IMU, vision alone is used.

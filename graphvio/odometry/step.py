@@ -41,7 +41,7 @@ class Step:
 
     Attributes:
         estimate: The estimate as `graphvio.Odometry.process` returns it.
-        motion: The relative motion that constrains the state; where the gate refused one, that one; or None.
+        motion: The relative motion that constrains the state, or else a refused one of good quality; otherwise None.
         used: Whether the motion passed the gate.
         interval: The IMU since the step before, or None.
         initialised: Whether the state was initialised or reinitialised here: earlier steps do not count any more.
