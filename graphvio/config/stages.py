@@ -17,10 +17,11 @@ class CornerConfig(Stage):
     min_response: float = 4.0
     """Smallest rms gradient along a corner's weaker direction, grey levels per pixel."""
     scarce_share: float = 0.33
-    """Where fewer of the cells hold a track with depth, new corners are also found before the reference changes; where
-    few do even with them, weaker corners are admitted."""
+    """If fewer than this share of the cells hold a track with depth, corners are found in every frame, not only at
+    keyframes; if it is still fewer with the new ones, corners down to ``noise_factor`` are accepted."""
     noise_factor: float = 1.5
-    """Smallest rms gradient of weaker corners, as a multiple of the standard deviation of the image's noise."""
+    """Smallest rms gradient of a corner where they are scarce, as a multiple of the standard deviation of the image's
+    noise."""
     border_px: int = 8
     """Corners and tracks nearer to the image's edge are dropped."""
 
@@ -75,7 +76,8 @@ class MotionConfig(Stage):
     hypotheses: int = 500
     """Maximum number of 3-point hypotheses of each pair."""
     confidence: float = 0.99999
-    """Probability of a hypothesis on three right points after which no more are sampled; 1 always samples them all."""
+    """RANSAC's confidence: sampling ends once a triple of inliers is among the samples with this probability; 1 always
+    samples all ``hypotheses``."""
     chunk_points: int = 100
     """Points of each pair on which the hypotheses are scored before half of them are dropped."""
     cauchy_scale_px: float = 1.5
@@ -92,8 +94,8 @@ class MotionConfig(Stage):
     """Factor on a motion's standard deviations, for errors that residuals do not show, such as those of matches that
     share a patch."""
     shared_error_share: float = 0.0002
-    """Standard deviation that errors which many points have in common add to a motion, as a share of its angle and
-    distance, where there is an IMU."""
+    """Error of a motion that its points have in common, so that residuals do not show it: one standard deviation, as a
+    share of the motion's angle and length. Only with an IMU."""
     calibration_error_share: float = 0.002
     """The same for errors of the rig file, where the calibration is not estimated during the run."""
     min_inliers: int = 12
@@ -120,15 +122,18 @@ class InitialisationConfig(Stage):
     window_s: float = 1.0
     """Time before the first frameset whose IMU samples are used."""
     min_window_s: float = 0.5
-    """With samples of less time before it, the first frameset is held until samples after it make up for them."""
+    """Shortest time of IMU samples for the initialisation. Where there is less before the first frameset, it is held
+    until there are samples of this time after it."""
     static_gyro_rad_s: float = 0.02
     """Largest standard deviation of the angular rate that counts as stationary."""
     static_accel_m_s2: float = 0.15
     """Largest standard deviation of the specific force that counts as stationary."""
     tilt_sigma_deg: float = 3.0
-    """After an initialisation in motion, estimates are ``initialising`` until the attitude is known this well,"""
+    """After an initialisation in motion, estimates are ``initialising`` until the standard deviations of roll and pitch
+    are below this, and those of the velocity below ``velocity_sigma_m_s``."""
     velocity_sigma_m_s: float = 0.3
-    """and the velocity this well: one standard deviation of roll and pitch, and of each component."""
+    """Standard deviation of each component of the velocity below which the initialisation ends, with
+    ``tilt_sigma_deg``."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +141,9 @@ class SmootherConfig(Stage):
     """The fixed-lag window, its gate and its limits (section 5)."""
 
     lag_s: float = 0.75
-    """Age from which a state may leave the window, unless later motions are measured from it: when the window is next
-    solved as a whole, up to two framesets later."""
+    """Length of the sliding window. Older states are marginalised when the window is next solved as a whole, up to two
+    framesets later, unless later motions are measured from them. Unused by a rig of single cameras, whose window has up
+    to 14 keyframes."""
     gate_probability: float = 0.9999
     """Vision is rejected where its innovation lies outside this share of the chi-square distribution. Without an IMU,
     the sigmas of the prediction are three times as large for it: constant velocity is no measurement."""
@@ -183,12 +189,13 @@ class FilterConfig(Stage):
     angular_accel_sigma_rad_s2: float = 10.0
     """Standard deviation of the angular acceleration within a step, eq. (11)."""
     gyro_bias_walk_rad_s: float = 1e-4
-    """Standard deviation of the gyro bias's change in one second, eq. (11)."""
+    """Random walk of the gyro bias, rad/s/sqrt(s), which is rad/s^2/sqrt(Hz): standard deviation of its change in one
+    second, eq. (11)."""
     gyro_sigma_rad_s: float = 0.02
     """Standard deviation of the gyro's mean rate over a step: much more than vision's when its poses are good."""
     gravity_sigma_m_s2: float = 10.0
-    """Standard deviation of the accelerometer as a measurement of gravity: the rig's own acceleration, which lasts for
-    several steps, so that it is set larger than it is."""
+    """Noise of the accelerometer as a measurement of gravity, one standard deviation. It includes the rig's own
+    acceleration, which is correlated over several steps, so it is set large."""
     gate_probability: float = 0.9999
     """A measurement is rejected where its innovation lies outside this share of the chi-square distribution."""
     max_accel_m_s2: float = 30.0
@@ -230,9 +237,9 @@ class OptimizationConfig(Stage):
     keyframe_interval_s: float = 0.2
     """Longest time between two states of the graph; all keyframes are states."""
     place_distance_m: float = 0.4
-    """Keyframes this far from the previous place are places, which are compared for loop closures,"""
+    """Distance from the previous place that makes a keyframe a place. Places are compared for loop closures."""
     place_angle_deg: float = 15.0
-    """or turned by so much."""
+    """Rotation from the previous place that also makes a keyframe a place."""
     features: int = 1000
     """SIFT features of a place's left image, the largest ones."""
     loop_interval_s: float = 10.0
