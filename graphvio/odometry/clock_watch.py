@@ -61,7 +61,7 @@ class ClockWatch:
         self._found_s: float | None = None  # by the last one
 
     def update(self, stamp_ns: int, sightings: Mapping[int, Sighting], has_pose: bool) -> bool:
-        """Take a frameset.
+        """Update the comparison of the gyro's turns with those of the cameras, by a frameset.
 
         Args:
             stamp_ns: Its stamp.

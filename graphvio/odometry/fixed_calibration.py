@@ -30,7 +30,7 @@ class FixedCalibration:
         """Collect no windows."""
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Leave the sample."""
+        """Ignore the sample."""
 
     def restart_imu(self) -> None:
         """Do nothing: there are no windows with samples."""
@@ -40,7 +40,7 @@ class FixedCalibration:
         return visual
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Leave the frameset."""
+        """Ignore the frameset."""
 
     def update(self, stamp_ns: int) -> None:
         """Change nothing."""

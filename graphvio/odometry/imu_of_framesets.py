@@ -163,7 +163,7 @@ class ImuOfFramesets:
         return ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
 
     def shows_standstill(self, interval: ImuInterval | None) -> bool:
-        """Whether the IMU shows a standstill; without an IMU it does, where samples are missing it does not."""
+        """Whether the IMU shows a standstill; True while no IMU is used, False where samples are missing."""
         if interval is None:
             return not self._estimator.has_imu
         return shows_standstill(interval, self._initialisation)

@@ -75,7 +75,7 @@ class ImuWatch:
     def update(
         self, stamp_ns: int, visual: VisualResult, gate_result: GateResult | None, is_applied: bool
     ) -> ImuMatch | None:
-        """Take a frameset.
+        """Update the test whether the IMU agrees with vision, by a frameset.
 
         Args:
             stamp_ns: Its stamp.

@@ -55,7 +55,7 @@ class InnovationAllowance:
         """The same one frameset before that and before those which motions are measured from."""
 
     def add(self, stamp_ns: int, estimator: StateEstimator, references: Set[int], covariance: Float) -> None:
-        """Take a frameset.
+        """Update what the state has followed, by a frameset.
 
         Args:
             stamp_ns: Its stamp.
@@ -79,7 +79,7 @@ class InnovationAllowance:
         self._velocity = _body_velocity(estimator)
 
     def recalibrate(self, change: Float) -> bool:
-        """Take note that motions are measured with another calibration from now on.
+        """Account for another calibration that motions are measured with from now on.
 
         Args:
             change: (C,) of the cameras' calibration.

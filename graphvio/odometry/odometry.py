@@ -137,10 +137,10 @@ class Odometry:
     # ------------------------------------------------------------------ measurements in, estimates out
 
     def process(self, measurement: Measurement) -> Estimate | None:
-        """Take one measurement.
+        """Feed one IMU sample or frameset, and return at most one estimate.
 
         Args:
-            measurement: An IMU sample or a frameset.
+            measurement: An IMU sample or a frameset; those of each sensor in time order.
 
         Returns:
             The estimate of the oldest frameset that is due, or None while there is none. At most one frameset is
@@ -163,10 +163,13 @@ class Odometry:
         return self.process_due()
 
     def process_due(self) -> Estimate | None:
-        """Return the estimate of the oldest frameset that is held though it is due, or None.
+        """Process the oldest held frameset that is due.
 
         Call it after `process` until it returns None where several framesets may become due at once and later
         measurements should not be waited for.
+
+        Returns:
+            Its estimate, or None if no frameset is due.
         """
         frameset = self._synchroniser.next_due(initialised=self._estimator.is_initialised)
         return None if frameset is None else self._estimate(frameset)
@@ -177,9 +180,12 @@ class Odometry:
         return self._synchroniser.held_ns
 
     def process_held(self) -> Estimate | None:
-        """Return the estimate of the oldest frameset that is held, or None, without waiting for its IMU samples.
+        """Process the oldest held frameset, without waiting for its IMU samples.
 
         For real time; samples that come later are used for the motion after it.
+
+        Returns:
+            Its estimate, or None if no frameset is held.
         """
         frameset = self._synchroniser.next_held()
         return None if frameset is None else self._estimate(frameset)

@@ -40,7 +40,7 @@ class OnlineCalibration(Protocol):
         """
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Take an IMU sample, in time order.
+        """Add an IMU sample, in time order.
 
         Args:
             sample: As it was measured, by the rig file's scale and axes and on the IMU's clock; not yet corrected.
@@ -60,7 +60,7 @@ class OnlineCalibration(Protocol):
         """
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Take a frameset, with its pose and its tracks.
+        """Update the estimation by a frameset, with its pose and its tracks.
 
         Args:
             stamp_ns: Of the frameset, by which the state has been updated.
@@ -80,7 +80,7 @@ class OnlineCalibration(Protocol):
         """
 
     def correct_pose(self, turned: Float) -> None:
-        """Take note that the newest pose has been changed, because `update` asked for it.
+        """Account for a change of the newest pose that `update` has asked for.
 
         Args:
             turned: (6,) tangent ``[rotation, translation]`` of the change, radians and metres, in body.

@@ -96,15 +96,15 @@ class PairsCalibration:
             self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
 
     def restart_imu(self) -> None:
-        """Leave the window that has samples of before."""
+        """Discard the window that is not full: it has samples of before."""
         self._calibration.restart_imu()
 
     def with_allowance(self, visual: VisualResult) -> VisualResult:
-        """Return motions with what errors of the calibration make them contradict the IMU by."""
+        """Attach to each motion the innovation covariance that errors of the calibration add."""
         return visual if self._allowance is None else self._allowance.allow(visual, self._estimator)
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Take a frameset as a keyframe to be, where its pose is of use."""
+        """Add a frameset as a candidate for a keyframe, where its pose is of use."""
         calibration, estimator = self._calibration, self._estimator
         if self._allowance is not None:
             self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, calibration.widest)

@@ -67,14 +67,14 @@ class Synchroniser:
         self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
-        """Take an IMU sample, and return those that are usable now, as they were measured but for their clock."""
+        """Add an IMU sample, and return those that are usable now, as they were measured but for their clock."""
         if self._clock_ns:
             sample = replace(sample, stamp_ns=sample.stamp_ns - self._clock_ns)
         passed = [each for confirmed in self._sample_jumps.confirm(sample) for each in self._spikes.confirm(confirmed)]
         return self._usable(passed)
 
     def last_samples(self) -> list[ImuSample]:
-        """Return the samples that are usable now that no other follows."""
+        """Return the samples that the spike filter has held back, when no other follows."""
         return self._usable(self._spikes.end())
 
     def _usable(self, samples: list[ImuSample]) -> list[ImuSample]:
@@ -94,7 +94,7 @@ class Synchroniser:
         return sample.stamp_ns - self._offset_ns, values
 
     def add_frameset(self, frameset: FrameSet) -> None:
-        """Take a frameset that is newer than those before it.
+        """Add a frameset to those that are held for the IMU; it has to be newer than those before it.
 
         Pairs may come in framesets of their own: less than 1 ms after a frameset that is still held, other pairs join
         it. A frameset so soon after one that has been processed, or with pairs that it has already, is left out.
@@ -193,7 +193,7 @@ class Synchroniser:
         return self._imu.means(self._offset_ns)
 
     def shift_clock(self, seconds: float) -> None:
-        """Take the stamps of samples that come from now on to be late by so many seconds more; older ones are dropped.
+        """Correct a jump of the IMU's clock: samples to come are stamped so many seconds earlier, kept ones dropped.
 
         In contrast to `shift_imu`, this is for a clock that has jumped, or is off by more than a calibration.
         """
@@ -203,7 +203,7 @@ class Synchroniser:
         self._spikes = SpikeGuard(self._report)
 
     def shift_imu(self, seconds: float) -> None:
-        """Add a correction, seconds, to the offset of the IMU's stamps from the framesets'."""
+        """Correct the time offset of the IMU from the framesets by so many seconds more; the samples are kept."""
         self._offset_ns += round(seconds * 1e9)
 
     @property
