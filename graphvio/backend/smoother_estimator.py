@@ -205,7 +205,7 @@ class SmootherEstimator:
         return StateUpdate(status, needs_keyframe=is_rebuilt)
 
     def leave_imu_out(self) -> None:
-        """Take note that the IMU is left out, until `use_imu_again`: nothing more of it will complete the state."""
+        """Stop waiting for the IMU until `use_imu_again`: the initialisation no longer needs what it would show."""
         self._is_imu_left_out = True
 
     def pose_by_vision(self) -> Float:
@@ -213,18 +213,19 @@ class SmootherEstimator:
         return self._refused.get(self.latest_ns, self.state().nav_T_body)
 
     def distrust_prediction(self) -> None:
-        """Take note that the IMU was corrected wrongly: motions that are being refused are right, and the state is not.
+        """Mark the prediction as wrong, after an error of the IMU's calibration, if motions are being refused.
 
-        Unlike when they are refused for too long, biases and attitude have followed wrong samples, and are opened.
+        The next motion of good quality then resets the state. Unlike when motions are refused for too long, biases and
+        attitude become uncertain, as they have followed wrong samples.
         """
         self._is_distrusted = bool(self._refused)
 
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
-        """Reinitialise at the newest pose for an IMU that was left out, of which the state knows nothing that is right.
+        """Use the IMU again after it was left out: keep the newest pose, and reset velocity, biases and gravity.
 
         Args:
             motion: By vision, that ends in the newest state.
-            match: How the IMU moves beside vision.
+            match: How the IMU moves beside vision; has the gyro bias and gravity.
         """
         self._is_imu_left_out = False
         try:

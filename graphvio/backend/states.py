@@ -82,26 +82,43 @@ class StateCovariance:
 
 
 def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
-    """Return the covariance (6, 6) of a pose that defines position and heading of nav, and measures roll and pitch."""
+    """Return the prior covariance (6, 6) of a first pose, tangent ``[rotation, translation]`` in body.
+
+    Position and heading are certain, as they define nav; roll and pitch have ``tilt_sigma_rad``.
+    """
     return _origin_covariance(nav_R_body, np.eye(2) * tilt_sigma_rad**2)
 
 
 def gravity_by_tilt(nav_R_body: Float, of_pose: Float, gravity_nav: Float) -> Float:
-    """Return the covariance (3, 3) of gravity (3,) in nav that the tilt of a pose (6, 6) is where it defines nav."""
+    """Convert a pose's attitude covariance into that of gravity's direction in nav, where the pose itself defines nav.
+
+    Args:
+        nav_R_body: (3, 3) attitude of the pose.
+        of_pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
+        gravity_nav: (3,) m/s^2.
+
+    Returns:
+        (3, 3), (m/s^2)^2.
+    """
     turned = skew(gravity_nav) @ nav_R_body
     return np.asarray(turned @ of_pose[:3, :3] @ turned.T)
 
 
 def certain_origin() -> Float:
-    """Return the covariance (6, 6) of a pose that defines all of nav: the same in any frame."""
+    """Return the prior covariance (6, 6) of a first pose that defines all of nav: nearly zero, in any frame."""
     return np.diag(np.repeat([_ATTITUDE_SIGMA_RAD, _POSITION_SIGMA_M], 3) ** 2)
 
 
 def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
-    """Split a pose's covariance (6, 6) into that of a pose that defines nav, and the remaining part.
+    """Split a pose's covariance into the prior of a first pose, and the part that the definition of nav takes over.
+
+    Args:
+        nav_R_body: (3, 3) attitude of the pose.
+        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in body.
 
     Returns:
-        (6, 6) of roll and pitch, and (6, 6) of heading and position; correlations between the two are left out.
+        (6, 6) of roll and pitch, with a heading and position that are certain, as of `origin_covariance`; and (6, 6) of
+        heading and position. Correlations between the two are left out.
     """
     about_nav = nav_R_body @ covariance[:3, :3] @ nav_R_body.T
     of_nav = np.zeros((6, 6))
