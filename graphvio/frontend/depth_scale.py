@@ -29,12 +29,12 @@ _WEAKEST_SIGMA = 10.0  # rad and m, of directions that no point constrains
 
 
 def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Refined, config: MotionConfig) -> Refined:
-    """Correct a motion that took single cameras' depths for right but for independent errors.
+    """Add one unknown scale of the depths of each single camera to a refined motion: the corrected motion.
 
     Args:
         rig: P pairs and single cameras.
         observations: N points of any subset of them.
-        refined: The minimum for scales of 1.
+        refined: The solution with all scales 1.
         config: Configuration of the motion stage.
     """
     singles = [j for j in observations.pairs if rig.is_single[j]]

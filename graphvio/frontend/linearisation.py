@@ -64,7 +64,7 @@ def unexpanded(blocks: Blocks) -> Expansion:
 
 @vector_kernel
 def expand(motions: Float, rig: RigArrays, blocks: Blocks, sigmas_px: Float, at: Expansion) -> None:
-    """Linearise the errors of all points by the points, and compute their whiteners.
+    """Re-estimate each point from both instants (errors in variables), and compute its whitener ``S^-1/2``.
 
     The search for the points' places continues from those of the last expansion.
 

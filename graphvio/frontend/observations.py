@@ -51,7 +51,10 @@ class RigArrays(NamedTuple):
         return np.asarray((self.cam_T_body[:, 0] == self.cam_T_body[:, 1]).all(axis=(1, 2)))
 
     def crossed(self, pairs: Sequence[tuple[int, int]]) -> RigArrays:
-        """Return a rig of (a, b): points of pair a's left camera at the reference are seen by pair b's cameras now."""
+        """Build a virtual rig with a pair for each of K pairs (a, b).
+
+        Its pair k has its points at the reference in the left camera of pair a, and sees them by the cameras of pair b.
+        """
         of, by = [a for a, _ in pairs], [b for _, b in pairs]
         return RigArrays(self.cam_T_body[by], self.body_T_left[of], self.focal_px[by])
 
@@ -112,7 +115,9 @@ def is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) 
 
 
 def image_by_image(rig: RigArrays, observations: Observations) -> tuple[RigArrays, Observations, Int]:
-    """Take each image for a pair of its own without a right camera, and points for exact.
+    """Split observations into those of single images, with exact points, as eq. (2) has them.
+
+    Each image becomes a pair of its own without a right camera, and the points' covariances zero.
 
     What kernels compute of one point is then the error of one image as a vector of two, with the plain noise of its
     pixels, as in eq. (2).

@@ -50,7 +50,7 @@ class References:
         self._frames.pop(pair, None)
 
     def shared(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
-        """Return reference frames of one instant: of several instants, that with most tracks in view."""
+        """Return reference frames of one stamp: where pairs have different ones, that with most tracks in common."""
         groups: dict[int, dict[int, PairFrame]] = {}
         for j in frames:
             if j in self._frames:
