@@ -43,8 +43,9 @@ class FrameSet:
     Attributes:
         stamp_ns: camera clock, nanoseconds.
         images: index in `graphvio.rig.Rig.groups` -> (left, right) of a pair, or (image,) of a single camera, each
-            (height, width) uint8. A group that delivered nothing is absent. They are kept until its next ones have
-            come, and not copied: a driver that fills the same buffer again has to hand over copies.
+            (height, width) uint8. A group that delivered nothing is absent. The arrays are referenced, not copied,
+            until the same group's next images have come: a driver that fills the same buffer again has to hand over
+            copies.
         masks: the same index -> a mask for each of its images, (height, width) uint8, whose zeros are not used, or
             None to use all of the image. A group without masks is absent.
     """

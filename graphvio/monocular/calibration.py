@@ -151,7 +151,7 @@ class WindowCalibration:
         return bool(far_off - as_stated > _MIN_LOG_BAYES_FACTORS[1])
 
     def doubts_file(self, adjusted: Adjusted, prior: Prior | None) -> bool:
-        """Let the window say how wrong the rig file is, and return whether that is news.
+        """Update the factors of the rig file from a window, and return whether they have changed.
 
         Args:
             adjusted: window.

@@ -82,7 +82,7 @@ class WindowCollector:
         self.keyframes.append(self._last)
 
     def restart(self) -> None:
-        """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
+        """Discard the window that is not full: the poses that come are in another frame, or their clock is another."""
         self.keyframes, self._last = [], None
 
     def forget_samples(self) -> None:

@@ -70,7 +70,7 @@ class ConsiderCovariance:
         self._left_behind = self._left_behind - change
 
     def forget(self) -> None:
-        """Note that the cameras were knocked: their errors now are not those by which the motions until now are off."""
+        """Freeze the covariance until now, after a knock: the calibration's error from now on is independent of it."""
         self._before_knock = self._at_newest
         self._gain, self._left_behind = np.zeros_like(self._gain), np.zeros(6)
 

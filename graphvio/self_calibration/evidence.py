@@ -151,8 +151,8 @@ class Evidence(NamedTuple):
     def mean_square(self, prior: FilePrior, in_force: Float, likelihood: FactorLikelihood | None = None) -> Float:
         """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
 
-        Here the file is as wrong as is most likely, be it for good reasons in force as it is. For arguments see
-        `file_factors`.
+        It takes the factors of the file that are most likely, even while the file is in force as if it were exact. For
+        arguments see `file_factors`.
         """
         factors, _ = self.file_factors(prior, np.zeros(prior.n_groups), likelihood)
         posterior = self.given(prior, factors)

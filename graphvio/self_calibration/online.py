@@ -180,12 +180,12 @@ class SelfCalibration:
         self._consider.correct(turned)
 
     def start_window(self) -> None:
-        """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
+        """Discard the window that is not full: the poses that come are in another frame, or their clock is another."""
         self._collector.restart()
         self._adjusted_at = 0
 
     def restart_imu(self) -> None:
-        """Leave what the IMU samples until now are a part of: those that come are of another clock."""
+        """Discard all that has IMU samples of before: those that come are of another clock."""
         self._drop_pending()
         self.start_window()
         self._collector.forget_samples()
@@ -261,13 +261,16 @@ class SelfCalibration:
         return _PACES[min(self._full_windows, len(_PACES) - 1)]
 
     def _refuse(self, is_full: bool) -> None:
-        """Leave a window out that contradicts those before it; several such windows are a knock."""
+        """Discard a window that contradicts those before it; several such windows are a knock."""
         self._refused += is_full
         if self._refused >= _MAX_REFUSED:
             self._forget_places(range(len(self._rig.groups)))
 
     def _drop_pending(self) -> None:
-        """Leave the window that is adjusted now, which is from before a break; it reads what changes then."""
+        """Discard the window that is being adjusted, which is from before a break.
+
+        It waits for the adjustment, which reads what changes after this call.
+        """
         if self._pending is not None:
             wait([self._pending])
             self._pending = None
