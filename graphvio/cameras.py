@@ -67,7 +67,8 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
     """Compute the distorted normalised coordinates of (x, y), and their Jacobian (2, 2).
 
     Returns:
-        ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``; outside the model's domain, (x, y) with the Jacobian -1.
+        ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``; outside the model's domain, (x, y) with the
+        Jacobian ``-I``, which marks them as invalid.
     """
     if model == EQUIDISTANT:
         r2 = x * x + y * y

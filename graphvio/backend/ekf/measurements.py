@@ -24,7 +24,7 @@ class Measurement:
     Attributes:
         name: Name of the sensor.
         innovation: (M,) measured minus expected value.
-        by_error: (M, 15) derivative of what is expected by the state's error.
+        by_error: (M, 15) measurement Jacobian H: derivative of the expected value by the state's error.
         covariance: (M, M) of the noise.
     """
 
@@ -39,7 +39,8 @@ class VisualRates:
     """Velocity and angular rate by vision, each the mean over the step that ends in the state.
 
     Attributes:
-        values: (6,) ``[v, omega]``, m/s and rad/s in body.
+        values: (6,) ``[v, omega]``, m/s and rad/s, in body. Of v it is body at the beginning of the step; the paper's
+            model compares it with the state's v, which is in body at the end.
         covariance: (6, 6).
     """
 

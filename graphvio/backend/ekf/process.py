@@ -19,7 +19,7 @@ def noise_sigmas(dt: float, accel_sigma_m_s2: float, angular_accel_sigma_rad_s2:
         dt: Time step, seconds.
         accel_sigma_m_s2: Of the unknown acceleration, constant within a step.
         angular_accel_sigma_rad_s2: Of the unknown angular acceleration.
-        gyro_bias_walk: Rad/s per root of a second.
+        gyro_bias_walk: Random walk of the gyro bias, rad/s/sqrt(s) (= rad/s^2/sqrt(Hz)), as in `graphvio.rig.Imu`.
     """
     return np.repeat([accel_sigma_m_s2 * dt, angular_accel_sigma_rad_s2 * dt, gyro_bias_walk * np.sqrt(dt)], 3)
 
@@ -36,9 +36,11 @@ def propagated(state: FilterState, dt: float) -> FilterState:
 
 
 def jacobians(state: FilterState, dt: float) -> tuple[Float, Float]:
-    """Return the derivatives of the next state's error by this one's (15, 15), and by the noise (15, 9).
+    """Return the state-transition Jacobian F (15, 15) and the noise Jacobian G (15, 9) of a step, eq. (11) and (12).
 
-    The same ``n_v`` and ``n_omega`` change the velocities and, through eq. (12), the motion during the step.
+    The motion of the step, eq. (12), is ``x_rel = (v + n_v) dt`` in body and ``rho_rel = (omega + n_omega) dt``. The
+    blocks of position by velocity and by ``n_v`` are the derivatives through ``x_rel``, those of attitude by rate and
+    by ``n_omega`` through ``rho_rel``. The same noise changes the velocities.
     """
     by_error, by_noise = np.eye(ERRORS), np.zeros((ERRORS, NOISES))
     turned = so3_right_jacobian(state.rate_body * dt) * dt
