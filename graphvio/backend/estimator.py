@@ -23,7 +23,8 @@ class MeasurementUpdate:
     """What became of a frameset's measurements.
 
     Attributes:
-        motion: The relative motion that constrains the newest state, or None where there is none or it was gated.
+        motion: The relative motion that constrains the newest state, or None where there is none or it was
+            rejected by the gate.
         needs_keyframe: Whether later motions have to be measured from the newest frameset, because no state is kept
             that they could be measured from otherwise.
     """

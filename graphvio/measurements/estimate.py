@@ -19,7 +19,7 @@ class Status(StrEnum):
     TRACKING = "tracking"
     """Vision constrains this frameset."""
     COASTING = "coasting"
-    """Vision failed or was gated; the pose is predicted and its covariance grows."""
+    """Vision failed or was rejected by the gate; the pose is predicted and its covariance grows."""
     LOST = "lost"
     """The position is too uncertain to be reported; the next pose begins a new epoch."""
 

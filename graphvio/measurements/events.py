@@ -73,10 +73,10 @@ class EventKind(StrEnum):
     MOTION_OVER_SEVERAL_STEPS = "motion_over_several_steps"
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
-    """Vision was gated for too long; the smoother is reinitialised from vision, the filter's velocities are reset.
-    Or the IMU's calibration turns out to be wrong while vision is gated: the smoother is reinitialised from vision.
-    Or the frameset that motions are measured from was gated, and the next motion passes: the smoother goes on from the
-    prediction, uncertain by what vision said."""
+    """The gate rejected vision for too long; the smoother is reinitialised from vision, the filter's velocities are
+    reset. Or the IMU's calibration turns out to be wrong while vision is rejected: the smoother is reinitialised from
+    vision. Or the frameset that motions are measured from was rejected, and the next motion passes: the smoother goes
+    on from the prediction, uncertain by what vision said."""
     SCALE_KNOWN = "scale_known"
     """A rig of single cameras has moved so that the scale is known; poses are estimated from now on."""
     LOST = "lost"
@@ -197,7 +197,7 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a person would want to know of: a gated measurement, a reset, a fault of the input.
+    """Something that a person would want to know of: a measurement that was rejected, a reset, a fault of the input.
 
     Attributes:
         stamp_ns: When, on the clock of the data concerned.
