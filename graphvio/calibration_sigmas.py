@@ -17,8 +17,8 @@ class CalibrationSigmas:
         focal_share: of each focal length, as a share of it.
         principal_point_px: of each coordinate of a principal point.
         distortion_share: of each distortion coefficient, as a share of it.
-        stereo_rotation_deg: of left to right, about each axis.
-        stereo_baseline_share: of the translation left to right, each coordinate, as a share of the baseline.
+        stereo_rotation_deg: of the rotation of ``right_T_left``, about each axis.
+        stereo_baseline_share: of the translation of ``right_T_left``, each coordinate, as a share of the baseline.
         body_rotation_deg: of all cameras together in body, about each axis.
         body_translation_m: of all cameras together in body, each coordinate.
         pair_rotation_deg: of each pair relative to the first one, about each axis.

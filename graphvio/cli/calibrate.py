@@ -64,8 +64,9 @@ def calibrate(
     IMU, if there is one.
 
     --what all finds everything, from a rig file that is about right: cameras (focal lengths, principal points,
-    distortion), stereo (left to right), imu (cameras to IMU, time offset, scale), and pairs. With cameras, stereo or
-    imu all else is kept as in the rig file, which must be right about it. With an IMU, single cameras will do.
+    distortion), stereo (the extrinsics left to right), imu (cameras to IMU, time offset, scale), and pairs. With
+    cameras, stereo or imu all else is kept as in the rig file, which must be right about it. With an IMU, single
+    cameras will do.
 
     Ends with exit code 0; with 2 where nothing can be determined; with 3 where the motions determine a part only.
 

@@ -193,7 +193,7 @@ def calibrate_recording(
 
     Raises:
         CalibrationError: if the rig cannot be calibrated so, or hardly moved.
-        RigError: if left to right is to be calibrated, and there is no pair.
+        RigError: if the stereo extrinsics are to be calibrated, and there is no pair.
     """
     config = replace(config or Config(), calibration=CalibrationConfig(online=True))
     if not config.estimates_calibration:

@@ -35,10 +35,10 @@ SCALE_MOTION = "accelerate: walk briskly with turns, or shake the rig"
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """One part of the calibration, such as the rotation from left to right of a pair.
+    """One part of the calibration, such as the rotation of a pair's stereo extrinsics.
 
     Attributes:
-        part: what it is, such as ``pair front, left to right``.
+        part: what it is, such as ``pair front, rotation left to right``.
         unit: of the difference.
         difference: (N,) from the rig file.
         sigmas: (N,) of it.

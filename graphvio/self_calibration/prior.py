@@ -45,7 +45,7 @@ _CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors hav
 def file_prior(rig: Rig) -> FilePrior:
     """Return the prior of all parameters of a rig, of its cameras and its IMU, by its `CalibrationSigmas`.
 
-    Cameras and left to right are one group, their places in body and the IMU another one.
+    Intrinsics and stereo extrinsics are one group, extrinsics in body and the IMU another one.
     """
     of_cameras = _covariance_of_cameras(rig)
     n = len(of_cameras)
@@ -182,7 +182,7 @@ def _covariance_of_cameras(rig: Rig) -> Float:
 
 
 def _sigmas_of_pair(pair: StereoPair, known: CalibrationSigmas) -> Float:
-    """Return the standard deviations (BODY,) of a pair's cameras and of left to right."""
+    """Return the standard deviations (BODY,) of a pair's intrinsics and stereo extrinsics."""
     sigmas = np.zeros(BODY)
     for which, camera in enumerate(pair.cameras):
         sigmas[which * CAMERA : (which + 1) * CAMERA] = _sigmas_of_lens(camera, known)
