@@ -55,6 +55,16 @@ def test_rotation_satisfies_equation_5() -> None:
     assert eigenvalues[0] < 1e-12 < 1e-3 < eigenvalues[1]
 
 
+def test_alignment_errors_are_those_of_equation_6_where_5_holds() -> None:
+    """For any translation: they are turned into the frame of the first camera, with the opposite sign."""
+    parts = PoseParts.of(synthetic_pairs(20, np.random.default_rng(1)).pairs)
+    R, T = LEFT2_T_LEFT1[:3, :3], np.array([0.3, -0.1, 0.2])
+    of_6 = parts.T_1 @ R.T + T - parts.R_2 @ T - parts.T_2
+    turned = -(np.swapaxes(parts.R_2 @ R, 1, 2) @ of_6[:, :, None])[:, :, 0]
+    assert np.abs(of_6).max() > 0.01
+    np.testing.assert_allclose(paper_method.alignment_errors(parts, R, -R.T @ T), turned, atol=1e-12)
+
+
 def test_calibrate_large_turns_ignore_quaternion_signs() -> None:
     """Turns of more than a half, whose quaternions change their sign."""
     pairs = synthetic_pairs(30, np.random.default_rng(2), turns=(1.2, 1.2, 1.2)).pairs

@@ -102,7 +102,7 @@ def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:
 
 
 def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
-    """Find T (3,) by least squares, eq. (10); the shortest one where it is not unique.
+    """Find T (3,) by least squares, eq. (10), see `translations`; the shortest one where it is not unique.
 
     Args:
         R: (3, 3).
@@ -113,7 +113,18 @@ def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
 
 
 def translations(R: Float, parts: PoseParts, noise_rad: float) -> Float:
-    """Find M of these, (M, 3), from rotations (M, 3, 3) and N pose pairs each, whose parts are (M, N, ...)."""
+    """Find translations T, eq. (10), for M sets of pose pairs at once.
+
+    ``A T = b`` is solved by the singular values of A: directions in which the rotations determine nothing are left out.
+
+    Args:
+        R: (M, 3, 3) rotations.
+        parts: of N pose pairs each, (M, N, ...).
+        noise_rad: standard deviation of a rotation, see `translation`.
+
+    Returns:
+        (M, 3), metres.
+    """
     A = (np.eye(3) - parts.R_2).reshape(len(R), -1, 3)
     # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
     b = (parts.T_2 - parts.T_1 @ np.swapaxes(R, 1, 2)).reshape(len(R), -1)
@@ -130,8 +141,8 @@ def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
     Each is the vector between the centres of the second camera at the end of a motion, as both cameras' motions predict
     it, in the frame of the first camera at the beginning; ``t = -R^T T`` is that centre in the first camera's frame.
     """
-    by_2 = np.einsum("ji,nkj,nk->ni", R, parts.R_2, parts.T_2)
-    by_1 = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)
+    by_2 = np.einsum("ji,nkj,nk->ni", R, parts.R_2, parts.T_2)  # R^T R_2^T T_2
+    by_1 = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)  # R_1^T (t - T_1)
     return np.asarray(by_2 + by_1 - t)
 
 
@@ -145,12 +156,12 @@ def jacobians(parts: PoseParts, R: Float) -> Float:
 
 def _by_turn(R: Float, crosses: Float) -> Float:
     """Differentiate the alignment errors by dq: (N, 3, 3)."""
-    return np.asarray(2.0 * np.einsum("ji,njk->nik", R, crosses))
+    return np.asarray(2.0 * np.einsum("ji,njk->nik", R, crosses))  # 2 R^T [R_2^T T_2]_x
 
 
 def _moved_crosses(parts: PoseParts) -> Float:
     """Return the matrices (N, 3, 3) of the cross products with ``R_2^T T_2``."""
-    return _crosses(np.einsum("nji,nj->ni", parts.R_2, parts.T_2))
+    return _crosses(np.einsum("nji,nj->ni", parts.R_2, parts.T_2))  # [R_2^T T_2]_x
 
 
 def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tuple[Float, Float]:
@@ -161,7 +172,7 @@ def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tupl
     damping, turned = _FIRST_DAMPING, _turned_axes(parts, noise_rad)
     errors = alignment_errors(parts, R, t)
     cost = float(np.sum(errors**2))
-    by_t, crosses = jacobians(parts, R)[:, :, :3] @ turned, _moved_crosses(parts)
+    by_t, crosses = jacobians(parts, R)[:, :, :3] @ turned, _moved_crosses(parts)  # these depend on neither R nor t
     for _ in range(_ITERATIONS):
         J = np.concatenate([by_t, _by_turn(R, crosses)], axis=2).reshape(-1, turned.shape[1] + 3)
         normal, gradient = J.T @ J, J.T @ errors.ravel()
