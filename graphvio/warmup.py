@@ -25,7 +25,7 @@ from graphvio.backend.states import RigState
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.frontend.alignment import learn_from_nothing
-from graphvio.frontend.cost import left_motions
+from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import with_unknown_scales
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
@@ -183,7 +183,7 @@ def _warm_up_motion(rig: Rig, config: Config) -> None:
     learn_from_nothing(motion)
     by_depth_errors(arrays, observations, motion.inlier, np.eye(4))
     if rig.pairs and rig.singles:
-        left_motions(motion.cur_T_ref, arrays)
+        camera_motions(motion.cur_T_ref, arrays)
         of_single = np.full(_POINTS, len(rig.pairs))
         with_unknown_scales(arrays, observations._replace(pair=of_single), motion, config.motion)
 

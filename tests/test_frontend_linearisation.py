@@ -12,7 +12,7 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.frontend.blocks import POINTS, SIZE, in_blocks, lane_by_lane, point_by_point
-from graphvio.frontend.cost import left_motions
+from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.observations import Observations, RigArrays
 
@@ -108,7 +108,7 @@ def linearised(
     blocks = in_blocks(seen)
     hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty((len(blocks.pair), POINTS))
     counted = lane_by_lane(blocks, np.ones(len(seen.pair)) if active is None else active)
-    motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
+    motions = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
     cost = linearise(motions, ARRAYS, blocks, at, counted, SCALE, hessian, gradient, errors2)
     return cost, hessian, gradient, point_by_point(blocks, errors2)
 
@@ -117,7 +117,7 @@ def expanded(seen: Observations, cur_T_ref: Float) -> Expansion:
     blocks = in_blocks(seen)
     at = unexpanded(blocks)
     for _ in range(2):  # the second goes on where the first ended
-        expand(left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, blocks, SIGMAS, at)
+        expand(camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, blocks, SIGMAS, at)
     return at
 
 
@@ -211,7 +211,7 @@ def test_information_through_points_matches_its_formula(pairs: tuple[int, ...], 
     expansion = expanded(seen, cur_T_ref)
     at, blocks = Places.of(seen, expansion), in_blocks(seen)
     factors = np.random.default_rng(3).uniform(-0.2, 1.0, len(seen.pair)).clip(0.0)
-    motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
+    motions = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
     found = information_through_points(motions, ARRAYS, blocks, expansion, SIGMAS, lane_by_lane(blocks, factors))
     expected = np.zeros((6, 6))
     for i, factor in enumerate(factors):
@@ -228,7 +228,7 @@ def test_linearise_leaves_out_points_behind_a_camera_and_inactive_ones() -> None
     seen, cur_T_ref = scene((0, 1), 0.6)
     at = Places.of(seen, expanded(seen, cur_T_ref))
     behind, n = 7, len(seen.pair)
-    motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
+    motions = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
     at.points[behind, 2] = -2.0 / motions[0, 0, 2, 3]  # the motion takes its depth from 1 to about -1 of itself
     active = np.arange(n) != 3
     cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, at.expansion(seen), active.astype(float))
@@ -245,7 +245,7 @@ def test_linearise_leaves_out_points_behind_a_camera_and_inactive_ones() -> None
 def test_linearise_with_points_next_to_the_camera_plane_stays_finite() -> None:
     """The derivatives of such points are without bounds; what is made of them must stay a number."""
     seen, cur_T_ref = scene((0, 1), 0.6)
-    depth = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)[0, 0, 2]
+    depth = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)[0, 0, 2]
     points, n = seen.points.copy(), len(seen.pair)
     near = np.flatnonzero(seen.pair == 0)[:10]
     for k, i in enumerate(near):  # depths over the reference depth of both signs, from nothing to a hundredth

@@ -10,7 +10,7 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import left_motions, robust_cost
+from graphvio.frontend.cost import camera_motions, robust_cost
 from graphvio.frontend.noise import noise_by_pair
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.paper_method import PairPoints, cost
@@ -199,7 +199,7 @@ def test_refine_with_wrong_points_next_to_the_camera_is_unbiased(off_px: float) 
     for i in range(wrong):  # a third of a metre away, and all seen to one side of where they should be
         points[i] = [0.1 * (i % 5) - 0.2, 0.05 * (i // 5), 3.0]
         for motion, image, focal_px in zip(
-            left_motions(TRUTH, ARRAYS)[0], (left, right), ARRAYS.focal_px[0], strict=True
+            camera_motions(TRUTH, ARRAYS)[0], (left, right), ARRAYS.focal_px[0], strict=True
         ):
             x, y, z = (motion @ [*points[i, :2], 1.0, points[i, 2]])[:3]
             image[i] = [x / z + off_px / focal_px, y / z]

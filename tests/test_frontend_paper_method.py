@@ -11,7 +11,7 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import left_motions, robust_cost
+from graphvio.frontend.cost import camera_motions, robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.paper_method import PairPoints, best_pair, cost, global_cost, h, motion_of_pair, rho
 from graphvio.frontend.refinement import refine
@@ -102,9 +102,9 @@ def test_cost_of_a_point_by_hand() -> None:
 
 
 @pytest.mark.parametrize("pairs", [1, 2, 3])
-def test_left_motions_are_eq_1(pairs: int) -> None:
+def test_camera_motions_are_eq_1(pairs: int) -> None:
     rig = rig_of(pairs)
-    motions = left_motions(TRUTH, RigArrays.of(rig))
+    motions = camera_motions(TRUTH, RigArrays.of(rig))
     for j, pair in enumerate(rig.pairs):
         P_1j = pair.left.cam_T_body @ rig.pairs[0].left.body_T_cam
         np.testing.assert_allclose(motions[j, 0], motion_of_pair(motions[0, 0], P_1j), atol=1e-12)

@@ -29,7 +29,7 @@ def elements(transform: Float) -> Matrix:
 
 
 @kernel
-def left_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
+def camera_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
     """Transfer a motion of body to each camera, eq. (1).
 
     Returns:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Bool, Float
-from graphvio.frontend.cost import left_motions
+from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_compose, se3_inverse
 from graphvio.kernels import kernel, put
@@ -36,7 +36,7 @@ def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cu
         (P, 2, 6) by an offset of all inverse depths of a pair, 1/m, and by a share of them; tangent ``[rotation,
         translation]`` in the body frame at the current instant. Zero for single cameras and pairs without points.
     """
-    n_pairs, motions = len(rig.focal_px), left_motions(cur_T_ref, rig)
+    n_pairs, motions = len(rig.focal_px), camera_motions(cur_T_ref, rig)
     information, derivatives = np.eye(6) / _WEAKEST_SIGMA**2, np.zeros((n_pairs, 2, 6))
     baselines = np.empty((n_pairs, 4, 4))
     for j in range(n_pairs):
@@ -86,7 +86,7 @@ def _add_image(
 
     Args:
         rig: P pairs and single cameras.
-        motions: (P, 2, 4, 4) of these, see `left_motions`.
+        motions: (P, 2, 4, 4) of these, see `camera_motions`.
         j: The pair.
         side: Its image.
         point: (3,) ``[x, y, 1/Z]`` at the reference.

@@ -17,7 +17,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.blocks import POINTS, in_blocks, lane_by_lane
-from graphvio.frontend.cost import left_motions
+from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.linearisation import expand, linearise, unexpanded
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
@@ -90,7 +90,7 @@ def _normal_equations(
     cur_T_ref: Float, rig: RigArrays, observations: Observations, inlier: Bool, sigma_px: float, scale: float
 ) -> tuple[Float, Float]:
     """Return the information (6, 6) and gradient (6,) of the inliers of N points at a motion."""
-    blocks, motions = in_blocks(observations), left_motions(cur_T_ref, rig)
+    blocks, motions = in_blocks(observations), camera_motions(cur_T_ref, rig)
     at = unexpanded(blocks)
     expand(motions, rig, blocks, np.full(len(rig.focal_px), sigma_px), at)
     hessian, gradient = np.empty((6, 6)), np.empty(6)

@@ -69,7 +69,7 @@ def expand(motions: Float, rig: RigArrays, blocks: Blocks, sigmas_px: Float, at:
     The search for the points' places continues from those of the last expansion.
 
     Args:
-        motions: (P, 2, 4, 4), see `graphvio.frontend.cost.left_motions`.
+        motions: (P, 2, 4, 4), see `graphvio.frontend.cost.camera_motions`.
         rig: of P pairs.
         blocks: of N points.
         sigmas_px: (P,) pixel noise of each pair.

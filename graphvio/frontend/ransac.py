@@ -4,7 +4,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import MAX_ERROR2, left_motions, score_all, squared_error_px
+from graphvio.frontend.cost import MAX_ERROR2, camera_motions, score_all, squared_error_px
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect
 from graphvio.geometry import se3_compose, se3_inverse
@@ -126,7 +126,7 @@ def _places_in_pair(pair: Int, pairs: int) -> Int:
 @kernel
 def _explained_shares(cur_T_ref: Float, rig: RigArrays, observations: Observations, max_error_px: float) -> Float:
     """Compute the share (P,) of each pair's points that a motion explains in both images; 0 without points."""
-    motions = left_motions(cur_T_ref, rig)
+    motions = camera_motions(cur_T_ref, rig)
     good, points = np.zeros(len(motions)), np.zeros(len(motions))
     for i in range(len(observations.pair)):
         j = observations.pair[i]

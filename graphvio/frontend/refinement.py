@@ -17,7 +17,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, point_by_point
-from graphvio.frontend.cost import left_motions
+from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.noise import influence, influence_slope, inlier_cutoff, noise_by_pair, noise_variance
 from graphvio.frontend.observations import Observations, RigArrays, image_by_image, is_depth_known
@@ -188,7 +188,7 @@ def _refined_per_image(
     scale = _scale(noise_variance(errors2[inlier], has_right[inlier], largest2), scale_px / sigma)
     hessian = np.empty((6, 6))
     linearise(
-        left_motions(pose, rig), rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
+        camera_motions(pose, rig), rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
         hessian, np.empty(6), np.empty((len(blocks.pair), POINTS)),
     )  # fmt: skip
     covariance, shared = _covariances(
@@ -218,7 +218,7 @@ def _covariances(
         if inlier[i]:
             factors[i] = influence_slope(errors2[i], has_right[i], scale) ** 2
     through_points = information_through_points(
-        left_motions(pose, rig), rig, blocks, at, sigmas_px, lane_by_lane(blocks, factors)
+        camera_motions(pose, rig), rig, blocks, at, sigmas_px, lane_by_lane(blocks, factors)
     )
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(product(product(used.variance * gain, through_points), gain), root, lower)
@@ -277,11 +277,11 @@ def _levenberg_marquardt(
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     for _ in range(rounds):
-        expand(left_motions(pose, rig), rig, blocks, sigmas_px, at)
+        expand(camera_motions(pose, rig), rig, blocks, sigmas_px, at)
         candidate, cost, damping, moved, length = pose, np.inf, 1e-5, 0.0, 0.0
         for _ in range(1 + _STEPS_PER_ROUND):
             new_cost = linearise(
-                left_motions(candidate, rig), rig, blocks, at, active, scale, new_hessian, new_gradient, new_errors2
+                camera_motions(candidate, rig), rig, blocks, at, active, scale, new_hessian, new_gradient, new_errors2
             )
             if new_cost <= cost:
                 pose, cost = candidate, new_cost
@@ -329,7 +329,7 @@ def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
 @kernel
 def _squared_errors(cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float) -> Float:
     """Compute squared whitened errors (N,), and expand ``at`` there."""
-    motions = left_motions(cur_T_ref, rig)
+    motions = camera_motions(cur_T_ref, rig)
     expand(motions, rig, blocks, sigmas_px, at)
     errors2 = np.empty((len(blocks.pair), POINTS))
     linearise(motions, rig, blocks, at, np.zeros_like(errors2), 1.0, np.empty((6, 6)), np.empty(6), errors2)

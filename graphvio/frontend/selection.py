@@ -6,7 +6,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import left_motions, robust_cost
+from graphvio.frontend.cost import camera_motions, robust_cost
 from graphvio.frontend.depth_scale import with_unknown_scales
 from graphvio.frontend.observations import Observations, RigArrays, is_depth_known
 from graphvio.frontend.ransac import search
@@ -69,7 +69,7 @@ def _with_noise_of_motion(covariances: Float, pair: Int, rig: RigArrays, first: 
     """
     scale = np.array([1.0, 1.0, max(sigma_px / (first.rms_px() or sigma_px), 1.0)])
     vague = covariances * np.outer(scale, scale)
-    translation = left_motions(first.cur_T_ref, rig)[:, 0, :3, 3]
+    translation = camera_motions(first.cur_T_ref, rig)[:, 0, :3, 3]
     variance = np.linalg.eigvalsh(first.covariance[3:, 3:])[-1]
     stands_out = np.maximum((translation**2).sum(axis=1) - _MIN_SIGMAS**2 * variance, 0.0)
     flow = (rig.focal_px[:, 0] ** 2 * stands_out)[pair]  # what it shows of inverse depths
