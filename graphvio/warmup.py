@@ -24,10 +24,10 @@ from graphvio.backend.propagation import Propagator
 from graphvio.backend.states import RigState
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
-from graphvio.frontend.alignment import learn_from_nothing
 from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import with_unknown_scales
+from graphvio.frontend.extrinsic_monitor import learn_from_nothing
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import inverse_depths_around

@@ -14,8 +14,8 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.alignment import combined, placed
 from graphvio.frontend.depth_scale import with_scale_of_depths, with_unknown_scales
+from graphvio.frontend.extrinsic_monitor import combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.frontend.alignment import Misalignment, PairAlignment
+from graphvio.frontend.extrinsic_monitor import ExtrinsicError, ExtrinsicMonitor
 from graphvio.frontend.observations import RigArrays
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_adjoint, se3_inverse
@@ -33,37 +33,37 @@ class Places:
 
     def __init__(self, rig: Rig, config: Config) -> None:
         monitored = range(1, 1 if config.estimates_calibration else len(rig.groups))
-        self._alignments = {j: PairAlignment() for j in monitored}
+        self._monitors = {j: ExtrinsicMonitor() for j in monitored}
         self.recalibrate(rig, {})
 
     @property
-    def misaligned(self) -> Mapping[int, Misalignment]:
+    def extrinsic_errors(self) -> Mapping[int, ExtrinsicError]:
         """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
-        return {j: alignment.in_force for j, alignment in self._alignments.items() if alignment.in_force is not None}
+        return {j: monitor.in_force for j, monitor in self._monitors.items() if monitor.in_force is not None}
 
     def recalibrate(self, rig: Rig, uncertain: Mapping[int, Float]) -> None:
         """Take another calibration of the cameras, and covariances (6, 6) of places relative to the first pair's."""
         self._nominal = RigArrays.of(rig)
         self.arrays = self._nominal
         self.uncertain = uncertain
-        for j, alignment in self._alignments.items():
-            if alignment.in_force is not None:
+        for j, monitor in self._monitors.items():
+            if monitor.in_force is not None:
                 self._correct(j)
 
     def learn(self, own: Mapping[int, Refined]) -> None:
         """Compare motions over a keyframe with the first pair's, and correct places that they refute."""
         if 0 not in own:
             return
-        for j, alignment in self._alignments.items():
+        for j, monitor in self._monitors.items():
             if j not in own:
                 continue
-            alignment.add(own[0], own[j])
-            if alignment.learn():
+            monitor.add(own[0], own[j])
+            if monitor.learn():
                 self._correct(j)
 
     def uncorrected(self, j: int, own: Refined) -> Refined:
         """Return a pair's own motion as it is without the correction in force."""
-        back = se3_inverse(self._alignments[j].correction) if j in self._alignments else np.eye(4)
+        back = se3_inverse(self._monitors[j].correction) if j in self._monitors else np.eye(4)
         adjoint = se3_adjoint(back)
         return replace(
             own,
@@ -73,7 +73,7 @@ class Places:
 
     def _correct(self, j: int) -> None:
         """Apply the correction in force of one place, or none."""
-        alignment = self._alignments[j]
-        self.arrays = self.arrays.corrected(self._nominal, j, alignment.correction)
+        monitor = self._monitors[j]
+        self.arrays = self.arrays.corrected(self._nominal, j, monitor.correction)
         others = {i: place for i, place in self.uncertain.items() if i != j}
-        self.uncertain = others if alignment.in_force is None else {**others, j: alignment.in_force.covariance}
+        self.uncertain = others if monitor.in_force is None else {**others, j: monitor.in_force.covariance}

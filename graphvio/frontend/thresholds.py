@@ -86,8 +86,8 @@ class ReferenceThresholds:
 
 
 @dataclass(frozen=True)
-class AlignmentThresholds:
-    """When the extrinsics between two pairs are taken to be wrong (`graphvio.frontend.alignment`).
+class ExtrinsicThresholds:
+    """When the extrinsics between two pairs are taken to be wrong (`graphvio.frontend.extrinsic_monitor`).
 
     Attributes:
         max_motions: Motions over whole keyframes that are kept.
@@ -140,7 +140,7 @@ class DecisionThresholds:
     agreement: AgreementThresholds = field(default_factory=AgreementThresholds)
     quality: QualityThresholds = field(default_factory=QualityThresholds)
     reference: ReferenceThresholds = field(default_factory=ReferenceThresholds)
-    alignment: AlignmentThresholds = field(default_factory=AlignmentThresholds)
+    extrinsics: ExtrinsicThresholds = field(default_factory=ExtrinsicThresholds)
     standstill: StandstillThresholds = field(default_factory=StandstillThresholds)
 
 

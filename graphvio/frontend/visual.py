@@ -13,8 +13,8 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
-from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.depth_errors import by_depth_errors
+from graphvio.frontend.extrinsic_monitor import ExtrinsicError
 from graphvio.frontend.frozen import Frozen, FrozenImages
 from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.motion_stereo import MotionHistory
@@ -118,9 +118,9 @@ class VisualFrontend:
         return self._places.arrays.body_T_left
 
     @property
-    def misaligned(self) -> Mapping[int, Misalignment]:
+    def extrinsic_errors(self) -> Mapping[int, ExtrinsicError]:
         """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
-        return self._places.misaligned
+        return self._places.extrinsic_errors
 
     @property
     def are_lines_off(self) -> bool:

@@ -352,7 +352,7 @@ class Odometry:
         readout = self._imu.readout_motion(frameset.stamp_ns)
         visual = self._frontend.process(frameset, self._estimator.motion_since, readout, self._imu.turned_since)
         if not predicted.is_initial:
-            self._vision_events.update(frameset.stamp_ns, visual, self._frontend.misaligned)
+            self._vision_events.update(frameset.stamp_ns, visual, self._frontend.extrinsic_errors)
         self.stage_ms.update(visual.stage_ms)
         return visual
 

@@ -6,7 +6,7 @@ from scipy.special import chdtri
 from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.alignment import PairAlignment, combined, placed
+from graphvio.frontend.extrinsic_monitor import ExtrinsicMonitor, combined, placed
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_exp, se3_log
 
@@ -25,31 +25,31 @@ def refined(motion: Float, rng: np.random.Generator, sigma: float) -> Refined:
 
 def watch(
     off: Float, keyframes: int, seed: int, outlier_share: float = 0.0, sigma: float = 2e-4
-) -> tuple[PairAlignment, np.random.Generator]:
+) -> tuple[ExtrinsicMonitor, np.random.Generator]:
     rng = np.random.default_rng(seed)
-    alignment = PairAlignment()
+    monitor = ExtrinsicMonitor()
     for _ in range(keyframes):
-        add_keyframe(alignment, off, rng, outlier_share, sigma)
-    return alignment, rng
+        add_keyframe(monitor, off, rng, outlier_share, sigma)
+    return monitor, rng
 
 
 def add_keyframe(
-    alignment: PairAlignment, off: Float, rng: np.random.Generator, outlier_share: float = 0.0, sigma: float = 2e-4
+    monitor: ExtrinsicMonitor, off: Float, rng: np.random.Generator, outlier_share: float = 0.0, sigma: float = 2e-4
 ) -> None:
     motion = random_transform(rng, 0.1, 0.2)
     seen = np.linalg.inv(se3_exp(off)) @ motion @ se3_exp(off)  # what the pair reports with the rig file's extrinsics
     if rng.random() < outlier_share:
         seen = seen @ random_transform(rng, 0.05, 0.1)
-    correction = alignment.correction
+    correction = monitor.correction
     reported = np.ascontiguousarray(correction @ seen @ np.linalg.inv(correction))
-    alignment.add(refined(motion, rng, sigma), refined(reported, rng, sigma))
+    monitor.add(refined(motion, rng, sigma), refined(reported, rng, sigma))
 
 
 def test_an_error_of_the_extrinsics_is_found() -> None:
     nees = []
     for seed in range(60):
-        alignment, _ = watch(OFF, 30, seed)
-        found = alignment.solve()
+        monitor, _ = watch(OFF, 30, seed)
+        found = monitor.solve()
         assert found is not None
         assert found.statistic > float(chdtri(6, 1e-9))
         error = se3_log(np.ascontiguousarray(se3_exp(found.tangent) @ np.linalg.inv(se3_exp(OFF))))
@@ -78,40 +78,40 @@ def test_motions_that_no_extrinsics_explain_are_no_error_of_them() -> None:
 
 
 def test_a_correction_in_force_goes_on_being_refined() -> None:
-    alignment, rng = watch(OFF, 10, 4)
+    monitor, rng = watch(OFF, 10, 4)
     for _ in range(6):
-        found = alignment.solve()
+        found = monitor.solve()
         assert found is not None
-        alignment.in_force = found
+        monitor.in_force = found
         for _ in range(10):
-            add_keyframe(alignment, OFF, rng)
-    found = alignment.solve()
+            add_keyframe(monitor, OFF, rng)
+    found = monitor.solve()
     assert found is not None
     np.testing.assert_allclose(found.tangent, OFF, atol=1e-3)
 
 
 def test_a_correction_that_the_motions_refute_is_withdrawn() -> None:
     """Something in view misled the pair for a while; from then on its motions say that the rig file was right."""
-    alignment, rng = watch(OFF, 10, 6)
-    assert alignment.learn()
-    assert not np.array_equal(alignment.correction, np.eye(4))
+    monitor, rng = watch(OFF, 10, 6)
+    assert monitor.learn()
+    assert not np.array_equal(monitor.correction, np.eye(4))
     changes = 0
     for _ in range(460):
-        add_keyframe(alignment, NONE, rng)
-        changes += alignment.learn()
+        add_keyframe(monitor, NONE, rng)
+        changes += monitor.learn()
     assert changes
-    np.testing.assert_array_equal(alignment.correction, np.eye(4))
+    np.testing.assert_array_equal(monitor.correction, np.eye(4))
 
 
 def test_what_no_motion_shows_is_not_made_up() -> None:
     """Turning about the vertical in a plane leaves the height difference open."""
     rng = np.random.default_rng(5)
-    alignment = PairAlignment()
+    monitor = ExtrinsicMonitor()
     for _ in range(40):
         motion = transform([0.0, 0.0, rng.normal(0.0, 0.1)], [*rng.normal(0.0, 0.1, 2), 0.0])
         seen = np.linalg.inv(se3_exp(OFF)) @ motion @ se3_exp(OFF)
-        alignment.add(refined(motion, rng, 1e-4), refined(np.ascontiguousarray(seen), rng, 1e-4))
-    found = alignment.solve()
+        monitor.add(refined(motion, rng, 1e-4), refined(np.ascontiguousarray(seen), rng, 1e-4))
+    found = monitor.solve()
     assert found is not None
     assert found.statistic > float(chdtri(6, 1e-9))
     sigmas = np.sqrt(np.diag(found.covariance))
@@ -122,12 +122,12 @@ def test_what_no_motion_shows_is_not_made_up() -> None:
 @pytest.mark.parametrize("translation_only", [True, False])
 def test_pure_translation_shows_rotation_only(translation_only: bool) -> None:
     rng = np.random.default_rng(6)
-    alignment = PairAlignment()
+    monitor = ExtrinsicMonitor()
     for _ in range(30):
         motion = random_transform(rng, 0.0 if translation_only else 0.1, 0.2)
         seen = np.linalg.inv(se3_exp(OFF)) @ motion @ se3_exp(OFF)
-        alignment.add(refined(motion, rng, 1e-4), refined(np.ascontiguousarray(seen), rng, 1e-4))
-    found = alignment.solve()
+        monitor.add(refined(motion, rng, 1e-4), refined(np.ascontiguousarray(seen), rng, 1e-4))
+    found = monitor.solve()
     assert found is not None
     sigmas = np.sqrt(np.diag(found.covariance))
     assert sigmas[:3].max() < 1e-3

@@ -21,10 +21,10 @@ from graphvio.geometry import se3_adjoint, se3_compose, se3_exp, se3_inverse, se
 from graphvio.kernels import kernel
 from graphvio.rig import Rig
 
-_T = THRESHOLDS.alignment
+_T = THRESHOLDS.extrinsics
 
 
-class Misalignment(NamedTuple):
+class ExtrinsicError(NamedTuple):
     """An error of a pair's extrinsics.
 
     Attributes:
@@ -37,13 +37,13 @@ class Misalignment(NamedTuple):
     covariance: Float
     statistic: float
 
-    def refutes(self, other: Misalignment) -> bool:
+    def refutes(self, other: ExtrinsicError) -> bool:
         """Whether the other error is significantly different."""
         apart = self.tangent - other.tangent
         return float(apart @ np.linalg.solve(self.covariance, apart)) > _T.max_chance_distance
 
 
-class PairAlignment:
+class ExtrinsicMonitor:
     """Estimates the error of a pair's extrinsics relative to another pair, from the motions of both.
 
     The extrinsics are taken as they are unless chance explains an error less than once in 10^9.
@@ -54,7 +54,7 @@ class PairAlignment:
 
     def __init__(self) -> None:
         self._motions: deque[tuple[Float, Float, Float]] = deque(maxlen=_T.max_motions)  # trusted, the pair's, whitener
-        self.in_force: Misalignment | None = None
+        self.in_force: ExtrinsicError | None = None
 
     @property
     def correction(self) -> Float:
@@ -81,7 +81,7 @@ class PairAlignment:
             return True
         return False
 
-    def solve(self) -> Misalignment | None:
+    def solve(self) -> ExtrinsicError | None:
         """Return the error of the rig's extrinsics, or None while too few motions agree on one."""
         if len(self._motions) < _T.min_motions:
             return None
@@ -98,24 +98,24 @@ class PairAlignment:
             d = d - np.linalg.solve(information, gradient)
         if np.mean(squared > 4.0 * _T.cauchy_scale) > _T.max_outlier_share:
             return None
-        return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
+        return ExtrinsicError(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
 
 def learn_from_nothing(motion: Refined) -> None:
-    """Compile the kernels of `PairAlignment` by a motion without information, for the warm-up."""
-    alignment = PairAlignment()
+    """Compile the kernels of `ExtrinsicMonitor` by a motion without information, for the warm-up."""
+    monitor = ExtrinsicMonitor()
     for _ in range(_T.min_motions):
-        alignment.add(motion, motion)
-    alignment.learn()
+        monitor.add(motion, motion)
+    monitor.learn()
 
 
-def describe(rig: Rig, pair: int, misalignment: Misalignment) -> str:
+def describe(rig: Rig, pair: int, error: ExtrinsicError) -> str:
     """Describe how far a pair is from where the rig has it, relative to the first pair, as a clause."""
     group = rig.groups[pair]
     kind = "pair" if pair < len(rig.pairs) else "camera"
     adjoint = se3_adjoint(np.ascontiguousarray(rig.pairs[0].left.cam_T_body))
-    turned, moved = np.split(adjoint @ misalignment.tangent, 2)
-    covariance = adjoint @ misalignment.covariance @ adjoint.T
+    turned, moved = np.split(adjoint @ error.tangent, 2)
+    covariance = adjoint @ error.covariance @ adjoint.T
     sigmas = np.sqrt([np.linalg.eigvalsh(block)[-1] for block in (covariance[:3, :3], covariance[3:, 3:])])
     angle, distance = float(np.linalg.norm(turned)), float(np.linalg.norm(moved))
     by_angle = f"{np.rad2deg(angle):.2f} (+- {np.rad2deg(sigmas[0]):.2f}) deg"
