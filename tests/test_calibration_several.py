@@ -13,7 +13,7 @@ from graphvio.arrays import Float
 from graphvio.calibration.nuisances import ScaleMode
 from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair
 from graphvio.calibration.segments import Segments, all_segments
-from graphvio.calibration.several import Places, pairwise, place_all
+from graphvio.calibration.several import CameraExtrinsics, pairwise, place_all
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 
@@ -25,12 +25,12 @@ PERIOD_NS = 100_000_000
 
 def segments(seed: int, walk: Walk = turning) -> Segments:
     rng = np.random.default_rng(seed)
-    places = [se3_inverse(np.ascontiguousarray(place)) for place in TRUTH]
-    cameras = [motions(walk, place, rng, period_ns=PERIOD_NS) for place in places]
+    extrinsics = [se3_inverse(np.ascontiguousarray(place)) for place in TRUTH]
+    cameras = [motions(walk, place, rng, period_ns=PERIOD_NS) for place in extrinsics]
     return all_segments(cameras[0].stamps_ns.tolist(), [each.between for each in cameras])
 
 
-def placed(made: Segments) -> Places:
+def placed(made: Segments) -> CameraExtrinsics:
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
         return calibrate_pair(made.of_both(one, other), scale_mode=mode)
 
@@ -40,25 +40,25 @@ def placed(made: Segments) -> Places:
 
 
 @cache
-def found(seed: int) -> Places:
+def found(seed: int) -> CameraExtrinsics:
     """From a sound walk."""
     return placed(segments(seed))
 
 
-def covariance_between(places: Places, one: int, other: int) -> Float:
+def covariance_between(extrinsics: CameraExtrinsics, one: int, other: int) -> Float:
     """Covariance (6, 6) of ``left_other_T_left_one``, tangent in the camera ``one``."""
     # X_ij = X_j X_i^-1: changes d_j of X_j and d_i of X_i, in left1, make Ad(X_i) (d_j - d_i).
-    apart = np.zeros((6, len(places.covariance)))
+    apart = np.zeros((6, len(extrinsics.covariance)))
     for camera, sign in ((other, 1.0), (one, -1.0)):
         if camera:
             apart[:, 6 * (camera - 1) : 6 * camera] += sign * np.eye(6)
-    apart = se3_adjoint(np.ascontiguousarray(places.left_T_left1[one])) @ apart
-    return np.asarray(apart @ places.covariance @ apart.T)
+    apart = se3_adjoint(np.ascontiguousarray(extrinsics.left_T_left1[one])) @ apart
+    return np.asarray(apart @ extrinsics.covariance @ apart.T)
 
 
-def error(places: Places) -> Float:
+def error(extrinsics: CameraExtrinsics) -> Float:
     """(12,) tangents to the truth."""
-    return np.concatenate([se3_log(se3_inverse(places.left_T_left1[j]) @ TRUTH[j]) for j in (1, 2)])
+    return np.concatenate([se3_log(se3_inverse(extrinsics.left_T_left1[j]) @ TRUTH[j]) for j in (1, 2)])
 
 
 def test_place_all_errors_are_within_covariance_and_no_larger_than_pairwise() -> None:
@@ -66,17 +66,17 @@ def test_place_all_errors_are_within_covariance_and_no_larger_than_pairwise() ->
     squares, ratios = [], []
     distances: list[float] = []
     for seed in range(runs):
-        places = found(seed)
-        off = error(places)
-        squares.append(off @ np.linalg.solve(places.covariance, off))
+        extrinsics = found(seed)
+        off = error(extrinsics)
+        squares.append(off @ np.linalg.solve(extrinsics.covariance, off))
         ratios.append(
-            np.trace(covariance_between(places, 1, 2) - SEEN_FROM)
-            / np.trace(places.pairwise[1, 2].covariance - SEEN_FROM)
+            np.trace(covariance_between(extrinsics, 1, 2) - SEEN_FROM)
+            / np.trace(extrinsics.pairwise[1, 2].covariance - SEEN_FROM)
         )
-        distances += places.distances.values()
-        (loop,) = places.loops
+        distances += extrinsics.distances.values()
+        (loop,) = extrinsics.loops
         assert loop.statistic < chi2.isf(1e-4, 6)
-        assert places.warnings == ()
+        assert extrinsics.warnings == ()
     low, high = band(runs, 12)
     assert low < np.mean(squares) < high
     assert np.median(ratios) < 1.02
@@ -84,16 +84,16 @@ def test_place_all_errors_are_within_covariance_and_no_larger_than_pairwise() ->
 
 
 def test_place_all_closes_loops_exactly() -> None:
-    places = found(1)
+    extrinsics = found(1)
     around = np.eye(4)
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        around = places.left_T_left1[j] @ se3_inverse(places.left_T_left1[i]) @ around
+        around = extrinsics.left_T_left1[j] @ se3_inverse(extrinsics.left_T_left1[i]) @ around
     np.testing.assert_allclose(around, np.eye(4), atol=1e-12)
 
 
 def test_covariance_between_matches_sampled_poses() -> None:
-    places = found(2)
-    root = np.linalg.cholesky(places.covariance)
+    extrinsics = found(2)
+    root = np.linalg.cholesky(extrinsics.covariance)
     rng = np.random.default_rng(0)
     between = LEFT3_T_LEFT1 @ se3_inverse(LEFT2_T_LEFT1)
     errors = []
@@ -101,7 +101,7 @@ def test_covariance_between_matches_sampled_poses() -> None:
         change = root @ rng.standard_normal(12)
         one, other = (TRUTH[j] @ se3_exp(np.ascontiguousarray(change[6 * j - 6 : 6 * j])) for j in (1, 2))
         errors.append(se3_log(se3_inverse(between) @ other @ se3_inverse(one)))
-    covariance, sampled = covariance_between(places, 1, 2), np.cov(np.array(errors).T)
+    covariance, sampled = covariance_between(extrinsics, 1, 2), np.cov(np.array(errors).T)
     np.testing.assert_allclose(np.diag(sampled), np.diag(covariance), rtol=0.15)
 
 
@@ -110,29 +110,29 @@ def test_place_all_camera_blind_at_times_is_consistent() -> None:
     made.known[made.start_ns > np.median(made.start_ns), 2] = False
     made.motions[~made.known] = np.nan
     made.covariances[~made.known] = np.nan
-    places = placed(made)
-    off = error(places)
-    assert off @ np.linalg.solve(places.covariance, off) < chi2.isf(1e-3, 12)
-    sigmas = np.sqrt(np.diag(places.covariance))
+    extrinsics = placed(made)
+    off = error(extrinsics)
+    assert off @ np.linalg.solve(extrinsics.covariance, off) < chi2.isf(1e-3, 12)
+    sigmas = np.sqrt(np.diag(extrinsics.covariance))
     assert np.all(sigmas[9:] > sigmas[3:6])
 
 
 def test_place_all_wrong_scale_is_corrected() -> None:
     made = segments(4)
     made.motions[:, 1, :3, 3] *= 1.02
-    places = placed(made)
-    assert any("back measures lengths 2." in sentence for sentence in places.warnings)
-    off = error(places)
-    assert off @ np.linalg.solve(places.covariance, off) < chi2.isf(1e-3, 12)
-    assert max(places.distances.values()) < chi2.isf(1e-3, 6)
-    assert places.loops[0].statistic < chi2.isf(1e-4, 6)
+    extrinsics = placed(made)
+    assert any("back measures lengths 2." in sentence for sentence in extrinsics.warnings)
+    off = error(extrinsics)
+    assert off @ np.linalg.solve(extrinsics.covariance, off) < chi2.isf(1e-3, 12)
+    assert max(extrinsics.distances.values()) < chi2.isf(1e-3, 6)
+    assert extrinsics.loops[0].statistic < chi2.isf(1e-4, 6)
 
 
 def test_place_all_planar_motion_leaves_heights_open() -> None:
-    places = placed(segments(5, planar))
+    extrinsics = placed(segments(5, planar))
     for one, other in combinations(range(3), 2):
-        assert not places.pairwise[one, other].observability.is_complete
-    sigmas = np.sqrt(np.diag(places.covariance))
+        assert not extrinsics.pairwise[one, other].observability.is_complete
+    sigmas = np.sqrt(np.diag(extrinsics.covariance))
     assert sigmas[4] > 1.0
     assert sigmas[10] > 1.0
     assert sigmas[[3, 5, 9, 11]].max() < 0.03

@@ -52,8 +52,8 @@ def test_innovation_errors_of_another_pairs_place_are_those_of_motions_by_it() -
         moved = RigCalibration.of(nominal).moved(difference).body_T_left[1]
         error = moved @ nominal.pairs[1].left.cam_T_body
         found.append(se3_log(se3_inverse(MOTION) @ error @ MOTION @ se3_inverse(error)))
-    assert_sampled(np.array(found), errors.of_other_place(1, MOTION))
-    assert not errors.of_other_place(0, MOTION).any()
+    assert_sampled(np.array(found), errors.of_other_extrinsics(1, MOTION))
+    assert not errors.of_other_extrinsics(0, MOTION).any()
 
 
 def test_innovation_errors_of_the_gyros_matrix_are_those_of_rates_by_a_wrong_matrix() -> None:

@@ -92,10 +92,10 @@ def calibrate_pairs(
         return calibrate_pair(segments.of_both(one, other), seed, scale_mode=mode)
 
     found, missing = pairwise(names, calibrate, scale_mode)
-    places = place_all(found, names, segments)
+    extrinsics = place_all(found, names, segments)
     imu, unchecked = _imu(rig, segments, np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
-    made = Calibration(names, places, rig, imu)
-    return replace(made, warnings=(*places.warnings, *missing, *rig_warnings(made), *unchecked))
+    made = Calibration(names, extrinsics, rig, imu)
+    return replace(made, warnings=(*extrinsics.warnings, *missing, *rig_warnings(made), *unchecked))
 
 
 def calibrate_trajectories(
@@ -140,7 +140,7 @@ def calibrate_trajectories(
         return calibrate_pair(both.segments, seed, nuisances=both.nuisances, scale_mode=mode, seen_from=_NO_ERROR)
 
     found, missing = pairwise(names, calibrate, scale_mode)
-    places = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _NO_ERROR)
+    extrinsics = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _NO_ERROR)
     clocks = None if same_clock else {each: _clock(two[each], found[each]) for each in found}
     drifts = [
         f"the clocks of {names[i]} and {names[j]} drift apart by {1e6 * clock.relation.drift:.0f} (+- "
@@ -148,7 +148,7 @@ def calibrate_trajectories(
         for (i, j), clock in (clocks or {}).items()
         if clock.drifts
     ]
-    return Calibration(tuple(names), places, clocks=clocks, warnings=(*places.warnings, *missing, *drifts))
+    return Calibration(tuple(names), extrinsics, clocks=clocks, warnings=(*extrinsics.warnings, *missing, *drifts))
 
 
 def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:

@@ -13,7 +13,7 @@ from graphvio.arrays import Bool, Float
 from graphvio.calibration.clocks import ClockRelation
 from graphvio.calibration.imu_alignment import ImuAlignment
 from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
-from graphvio.calibration.several import Places
+from graphvio.calibration.several import CameraExtrinsics
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, se3_log, so3_log, so3_right_jacobian_inverse
 from graphvio.rig import Rig, StereoPair
@@ -93,7 +93,7 @@ class Calibration:
     """
 
     names: tuple[str, ...]
-    places: Places
+    places: CameraExtrinsics
     rig: Rig | None = None
     imu: Mapping[int, ImuAlignment] | None = None
     clocks: Mapping[tuple[int, int], Clock] | None = None

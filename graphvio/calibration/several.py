@@ -35,7 +35,7 @@ class Loop:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class CameraExtrinsics:
     """The poses of all cameras relative to the first."""
 
     left_T_left1: Float  # (J, 4, 4) pose of the first left camera in each; the first is the identity
@@ -87,7 +87,7 @@ def place_all(
     names: Sequence[str],
     segments: Segments,
     seen_from: Float = SEEN_FROM,
-) -> Places:
+) -> CameraExtrinsics:
     """Find the poses that fit all motions at once.
 
     Args:
@@ -111,7 +111,7 @@ def place_all(
     count = len(names)
     start = np.array([np.eye(4), *(found[0, j].left2_T_left1 for j in range(1, count))])
     if count == 2:
-        return Places(start, found[0, 1].covariance, found, (), {}, tuple(warnings))
+        return CameraExtrinsics(start, found[0, 1].covariance, found, (), {}, tuple(warnings))
     segments = _rescaled(segments, found)
     chosen = segments.select(most_informative(segments, _gains(segments, found, count)))
     held = [found[0, j].observability.undetermined for j in range(1, count)]
@@ -134,7 +134,7 @@ def place_all(
         for three in combinations(range(count), 3)
         if all(two in found for two in combinations(three, 2))
     )
-    return Places(solution.left_T_left1, covariance, found, loops, distances, tuple(warnings))
+    return CameraExtrinsics(solution.left_T_left1, covariance, found, loops, distances, tuple(warnings))
 
 
 def _rescaled(segments: Segments, found: Mapping[tuple[int, int], PairCalibration]) -> Segments:

@@ -22,7 +22,7 @@ and the noise that `noise` estimates from the residuals). `selection` joins the 
 writes them.
 
 *Decisions.* `agreement` finds consensus sets of pairs, `quality` grades a motion, `references` says when a keyframe
-ends. `places` has the poses of the cameras in body that are in force, and `extrinsic_monitor` tests the transfer
+ends. `extrinsics` has the poses of the cameras in body that are in force, and `extrinsic_monitor` tests the transfer
 between pairs. `standstill` and `frozen` look for images that do not change. `thresholds` has all numbers that these
 decisions depend on, and `pair_reports` reports what each pair contributed.
 

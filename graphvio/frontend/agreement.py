@@ -128,7 +128,7 @@ def _consensus_sets(pairs: Sequence[int], apart: Mapping[tuple[int, int], float]
 
 
 def _in_order(hypotheses: list[MotionHypothesis], unknown: frozenset[int] = frozenset()) -> list[MotionHypothesis]:
-    """Sort by support, but comparable ones by their lowest pair, and last those of cameras in unknown places only.
+    """Sort by support, but comparable ones by their lowest pair, and last those of cameras of unknown extrinsics only.
 
     With wrong extrinsics several pairs are right, and alternating between them would accumulate the error.
     """

@@ -130,12 +130,12 @@ def describe(rig: Rig, pair: int, error: ExtrinsicError) -> str:
     )
 
 
-def placed(motion: Refined, of_place: Float | None) -> Refined:
+def placed(motion: Refined, extrinsics_covariance: Float | None) -> Refined:
     """Enlarge the covariance of a pair's motion by that of its extrinsics (6, 6), None where these are exact."""
-    if of_place is None:
+    if extrinsics_covariance is None:
         return motion
     lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
-    return replace(motion, covariance=motion.covariance + lever @ of_place @ lever.T)
+    return replace(motion, covariance=motion.covariance + lever @ extrinsics_covariance @ lever.T)
 
 
 def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:

@@ -156,7 +156,7 @@ class SinglesFrontend(VisualFrontend):
                 return True
             rays = np.column_stack([reference.left[then], np.ones(len(then))])
             if cur_T_reference is not None:
-                body_R_cam = self._places.arrays.body_T_left[j][:3, :3]
+                body_R_cam = self._extrinsics.arrays.body_T_left[j][:3, :3]
                 rays = rays @ (body_R_cam.T @ cur_T_reference[:3, :3] @ body_R_cam).T
             ahead = rays[:, 2] > 0.1
             moved = frame.left[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]

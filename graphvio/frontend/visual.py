@@ -15,12 +15,12 @@ from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.extrinsic_monitor import ExtrinsicError
+from graphvio.frontend.extrinsics import RigExtrinsics
 from graphvio.frontend.frozen import Frozen, FrozenImages
 from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.motion_stereo import MotionHistory
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
-from graphvio.frontend.places import Places
 from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
@@ -90,7 +90,7 @@ class VisualFrontend:
         self.stage_ms: dict[str, float] = {}
         self._config = config
         self._rig = rig
-        self._places = Places(rig, config)
+        self._extrinsics = RigExtrinsics(rig, config)
         self._history = MotionHistory()
         self._trackers = [PairTracker(group, config, self._history, image_mask) for group in rig.groups]
         self._baselines_m = _baselines_m(rig)
@@ -115,12 +115,12 @@ class VisualFrontend:
     @property
     def body_T_left(self) -> Float:
         """(P, 4, 4) of the groups' left cameras, with the corrections that are in force."""
-        return self._places.arrays.body_T_left
+        return self._extrinsics.arrays.body_T_left
 
     @property
     def extrinsic_errors(self) -> Mapping[int, ExtrinsicError]:
         """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
-        return self._places.extrinsic_errors
+        return self._extrinsics.extrinsic_errors
 
     @property
     def are_lines_off(self) -> bool:
@@ -153,7 +153,7 @@ class VisualFrontend:
         self._history.recalibrate(new_T_old)
         self._rig = rig
         self._baselines_m = _baselines_m(rig)
-        self._places.recalibrate(rig, uncertain)
+        self._extrinsics.recalibrate(rig, uncertain)
         for tracker, group in zip(self._trackers, rig.groups, strict=True):
             tracker.recalibrate(group, epipolar_margin_px)
         self._move_trackers()
@@ -263,14 +263,16 @@ class VisualFrontend:
         predicted = predict(seen.reference_stamp_ns)
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
-            arrays = self._places.arrays
+            arrays = self._extrinsics.arrays
             refined, observations = joint_motion_with_vague_depths(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
-            agreement = agree(self._places.arrays, observations, refined, config, rng, self._places.uncertain, in_doubt)
+            agreement = agree(
+                self._extrinsics.arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt
+            )
             if agreement.contradicts:
                 self._contradicted_ns = seen.stamp_ns
         else:
-            refined = best_pair_motion(self._places.arrays, observations, start, config, rng)
+            refined = best_pair_motion(self._extrinsics.arrays, observations, start, config, rng)
             agreement = Agreement((MotionHypothesis(observations.pairs, refined),), {})
         best = agreement.hypotheses[0]
         rows = np.isin(observations.pair, best.pairs)
@@ -321,7 +323,7 @@ class VisualFrontend:
         if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
             return {}, {}
         own = self._own_motions(seen, agreement)
-        self._places.learn(agreement.own)
+        self._extrinsics.learn(agreement.own)
         self._move_trackers()
         self._history.advance(seen.reference_stamp_ns, seen.stamp_ns, refined.cur_T_ref, refined.covariance)
         return self._refer_to(seen.frames), own
@@ -347,7 +349,7 @@ class VisualFrontend:
         """Return the motion of points in a pair's left camera for one of body, by eq. (1)."""
         if cur_T_then is None:
             return None
-        body_T_left = self._places.arrays.body_T_left[pair]
+        body_T_left = self._extrinsics.arrays.body_T_left[pair]
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
 
     def _steady_readout(self, stamp_ns: int, predict: MotionPredictor) -> ReadoutMotion | None:
@@ -393,7 +395,7 @@ class VisualFrontend:
         if not self._config.estimates_calibration or self._rig.imu is None:
             return motion
         observations, cur_T_ref = seen.correspondences.observations, np.ascontiguousarray(refined.cur_T_ref)
-        derivatives = by_depth_errors(self._places.arrays, observations, refined.inlier, cur_T_ref)
+        derivatives = by_depth_errors(self._extrinsics.arrays, observations, refined.inlier, cur_T_ref)
         return replace(motion, by_depth_errors=derivatives)
 
     def _own_motions(self, seen: _Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
@@ -404,13 +406,13 @@ class VisualFrontend:
         for j, refined in (agreement.own or alone).items():
             if j >= len(self._rig.pairs):
                 continue
-            motions[j] = self._relative_motion(seen, self._places.uncorrected(j, refined))
+            motions[j] = self._relative_motion(seen, self._extrinsics.uncorrected(j, refined))
         return motions
 
     def _move_trackers(self) -> None:
         """Give the single cameras' trackers the poses by which they locate points."""
         for j in range(len(self._rig.pairs), len(self._rig.groups)):
-            self._trackers[j].move(self._places.arrays.body_T_left[j])
+            self._trackers[j].move(self._extrinsics.arrays.body_T_left[j])
 
 
 def _baselines_m(rig: Rig) -> list[float]:

@@ -21,7 +21,7 @@ from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OF
 from graphvio.self_calibration.parameters import n_of_cameras
 from graphvio.self_calibration.prior import file_prior
 
-_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of lenses, and of places and the IMU
+_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of intrinsics, and of extrinsics and the IMU
 _MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts of it that nothing has shown yet
 _FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
 _FAR_OFF = 3.0  # factor of a file whose scale is not to be trusted
@@ -42,8 +42,8 @@ class WindowCalibration:
 
     Attributes:
         size: number F of parameters, 0 where they are not estimated.
-        factors: (G,) by which the file's errors exceed its standard deviations, of lenses and of places with the IMU;
-            `EXACT` where the file is as good as exact.
+        factors: (G,) by which the file's errors exceed its standard deviations, of intrinsics and of extrinsics with
+            the IMU; `EXACT` where the file is as good as exact.
         log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
         latest: what is known of all parameters, updated once a second; None before, and where they are not estimated.
     """
@@ -140,7 +140,7 @@ class WindowCalibration:
         self._files.clear()
 
     def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
-        """Return whether a first window, adjusted with an exact file, says that places or the IMU are far off in it.
+        """Return whether a first window, adjusted with an exact file, says that its extrinsics or IMU are far off.
 
         Arguments as `doubts_file`.
         """

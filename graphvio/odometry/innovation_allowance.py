@@ -126,7 +126,7 @@ class InnovationAllowance:
             added = added + self._errors.of_depths(by_depth_errors)
         if followed is not None and followed.pairs != pairs:
             for j in followed.pairs ^ pairs:
-                added = added + self._errors.of_other_place(j, motion.reference_T_current)
+                added = added + self._errors.of_other_extrinsics(j, motion.reference_T_current)
         return replace(motion, calibration_covariance=added)
 
 

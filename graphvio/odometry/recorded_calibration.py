@@ -35,7 +35,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """What can be calibrated -> the standard deviations of its parameters, see `CalibrationSigmas`."""
 _FIXED = {"cameras": _STEREO, "stereo": _CAMERAS, "imu": _CAMERAS + _STEREO, "all": ()}
-"""What is fixed meanwhile. Where pairs and IMU are is estimated along: wrong places would be taken for cameras."""
+"""What is fixed meanwhile. Where pairs and IMU are is estimated along: wrong extrinsics would be taken for cameras."""
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how much of it is done, and how much there is."""

@@ -16,9 +16,9 @@ from graphvio.self_calibration.parameters import (
     CAMERA,
     INTRINSICS,
     STEREO,
+    extrinsics_of,
     has_coefficient,
     n_of_cameras,
-    place_of,
     relative_to_first,
     slices_of_groups,
 )
@@ -117,10 +117,10 @@ def _of_imu(rig: Rig) -> Iterator[Curve]:
     if rig.imu is None:
         return
     unit = np.eye(_size(rig))
-    imu, place = unit[n_of_cameras(rig) :], unit[place_of(rig, 0)]
+    imu, extrinsics = unit[n_of_cameras(rig) :], unit[extrinsics_of(rig, 0)]
     for i, axis in enumerate(_AXES):
-        yield Curve("cameras to IMU, rotation", "deg", "", axis, _DEG * place[i])
-        yield Curve("cameras to IMU, translation", "mm", "", axis, 1e3 * place[3 + i])
+        yield Curve("cameras to IMU, rotation", "deg", "", axis, _DEG * extrinsics[i])
+        yield Curve("cameras to IMU, translation", "mm", "", axis, 1e3 * extrinsics[3 + i])
     yield Curve("IMU, time offset", "ms", "", "", 1e3 * imu[TIME_OFFSET])
     for i, axis in enumerate(_AXES):
         yield Curve("IMU, gyro's scale", "%", "", axis, 100.0 * imu[GYRO_MATRIX + 4 * i])

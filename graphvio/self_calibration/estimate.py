@@ -23,8 +23,8 @@ class CalibrationEstimate:
         file_rig: the rig of the file.
         posterior: of the difference from it (see `graphvio.self_calibration.parameters`), if no part is exact.
         difference: (C,) that is in force, with zero for what is exact.
-        file_factors: (G,) by which factors the file's errors exceed their standard deviations: of cameras and left
-            to right, and of the places of pairs and the IMU. `EXACT` where the file is as good as exact.
+        file_factors: (G,) by which factors the file's errors exceed their standard deviations: of intrinsics and
+            stereo extrinsics, and of extrinsics in body and the IMU. `EXACT` where the file is as good as exact.
         log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is very
             strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
         is_changed: whether a knock has changed the cameras since the file was made.

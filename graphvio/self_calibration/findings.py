@@ -17,8 +17,8 @@ from graphvio.self_calibration.parameters import (
     CAMERA,
     INTRINSICS,
     STEREO,
+    extrinsics_of,
     n_of_cameras,
-    place_of,
     relative_to_first,
     slices_of_groups,
 )
@@ -140,9 +140,9 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
             yield f"{name}, translation against {first}", "mm", 1e3, relative[3:], 3.0, _TURN
     if rig.imu is None:
         return
-    at, place = n_of_cameras(rig), whole[place_of(rig, 0)]
-    yield "cameras to IMU, rotation", "deg", deg, place[:3], 0.1, _TURN
-    yield "cameras to IMU, translation", "mm", 1e3, place[3:], 3.0, _TURN
+    at, extrinsics = n_of_cameras(rig), whole[extrinsics_of(rig, 0)]
+    yield "cameras to IMU, rotation", "deg", deg, extrinsics[:3], 0.1, _TURN
+    yield "cameras to IMU, translation", "mm", 1e3, extrinsics[3:], 3.0, _TURN
     yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN
     yield "IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN
     yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION

@@ -8,19 +8,20 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import about_origin, depths_of_pair, n_of_cameras, place_of
+from graphvio.self_calibration.parameters import about_origin, depths_of_pair, extrinsics_of, n_of_cameras
 from graphvio.self_calibration.prior import extrinsic_covariances
 
 _ERROR_SHARE = 0.2  # of what wrong depths do, in all directions: errors away from the middle of the image do otherwise
 
 
 class InnovationErrors:
-    """Errors of cameras and their place in body, of the gyro's matrix and of the time offset, in a motion's innovation.
+    """Errors of cameras and their extrinsics, of the gyro's matrix and of the time offset, in a motion's innovation.
 
     The innovation is the motion of body by vision less that by the IMU. To a motion M of body, an error d of the
-    cameras' place adds ``(Ad(M^-1) - I) d``, an error D of the gyro's matrix the rotation ``D phi`` with M's rotation
-    vector phi, and an error of the time offset the motion that body makes in it at the end, less that at the beginning.
-    Errors within a pair add what wrong depths do, see `graphvio.frontend.depth_errors`. All are taken as independent.
+    cameras' extrinsics adds ``(Ad(M^-1) - I) d``, an error D of the gyro's matrix the rotation ``D phi`` with M's
+    rotation vector phi, and an error of the time offset the motion that body makes in it at the end, less that at the
+    beginning. Errors within a pair add what wrong depths do, see `graphvio.frontend.depth_errors`. All are taken as
+    independent.
 
     Args:
         covariance: (C, C) of the calibration of the cameras and the IMU.
@@ -30,8 +31,8 @@ class InnovationErrors:
     def __init__(self, covariance: Float, rig: Rig) -> None:
         n, to_origin = n_of_cameras(rig), about_origin(rig, 0)
         imu = covariance[n:, n:]
-        self._of_place = to_origin @ covariance[place_of(rig, 0), place_of(rig, 0)] @ to_origin.T
-        self._of_other_places = extrinsic_covariances(rig, covariance)
+        self._covariance_in_body = to_origin @ covariance[extrinsics_of(rig, 0), extrinsics_of(rig, 0)] @ to_origin.T
+        self._relative_covariances = extrinsic_covariances(rig, covariance)
         by_depths = [depths_of_pair(rig, j) for j in range(len(rig.pairs))]
         self._of_depths = [rows @ covariance[:n, :n] @ rows.T for rows in by_depths]
         self._of_matrix = imu[GYRO_MATRIX:ACCEL_MATRIX, GYRO_MATRIX:ACCEL_MATRIX].reshape(3, 3, 3, 3)
@@ -50,8 +51,8 @@ class InnovationErrors:
             (6, 6), tangent ``[rotation, translation]`` in the body frame of the later instant.
         """
         carried = se3_adjoint(se3_inverse(motion))
-        by_place = carried - np.eye(6)
-        covariance = by_place @ self._of_place @ by_place.T
+        by_extrinsics = carried - np.eye(6)
+        covariance = by_extrinsics @ self._covariance_in_body @ by_extrinsics.T
         phi = so3_log(motion)
         covariance[:3, :3] += np.einsum("iajb,a,b->ij", self._of_matrix, phi, phi)
         if before is not None and now is not None:
@@ -75,9 +76,9 @@ class InnovationErrors:
             added[block, block] += _ERROR_SHARE**2 * np.trace(added[block, block]) / 3.0 * np.eye(3)
         return added
 
-    def of_other_place(self, j: int, motion: Float) -> Float:
-        """Return the covariance (6, 6) that the error of a pair's place relative to the first pair adds to a motion."""
-        if j not in self._of_other_places:
+    def of_other_extrinsics(self, j: int, motion: Float) -> Float:
+        """Return the covariance (6, 6) that errors of a pair's pose relative to the first pair add to a motion."""
+        if j not in self._relative_covariances:
             return np.zeros((6, 6))
-        by_place = se3_adjoint(se3_inverse(motion)) - np.eye(6)
-        return np.asarray(by_place @ self._of_other_places[j] @ by_place.T)
+        by_extrinsics = se3_adjoint(se3_inverse(motion)) - np.eye(6)
+        return np.asarray(by_extrinsics @ self._relative_covariances[j] @ by_extrinsics.T)

@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.cameras import central_scale, unproject_pixels
 from graphvio.geometry import skew
 from graphvio.rig import Rig
-from graphvio.self_calibration.parameters import STEREO, RigCalibration, place_of, slices_of_groups
+from graphvio.self_calibration.parameters import STEREO, RigCalibration, extrinsics_of, slices_of_groups
 from graphvio.self_calibration.window import View
 
 _MIN_MATCHES = 30
@@ -65,8 +65,8 @@ def knock_covariance(rig: Rig, n_parameters: int, groups: Iterable[int]) -> Floa
     """
     variances = np.zeros(n_parameters)
     for j in groups:
-        own, place = variances[slices_of_groups(rig)[j]], variances[place_of(rig, j)]
+        own, extrinsics = variances[slices_of_groups(rig)[j]], variances[extrinsics_of(rig, j)]
         if j < len(rig.pairs):
             own[STEREO : STEREO + 3] = _TURNED_RAD**2
-        place[:3], place[3:] = _TURNED_RAD**2, _MOVED_M**2
+        extrinsics[:3], extrinsics[3:] = _TURNED_RAD**2, _MOVED_M**2
     return np.diag(variances)

@@ -37,7 +37,7 @@ _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one tra
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
 _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
-"""Against exact files, of cameras and of places. Cameras that are not exact reach hundreds with the first image."""
+"""Against exact files, of cameras and of extrinsics. Cameras that are not exact reach hundreds with the first image."""
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
@@ -84,7 +84,7 @@ class SelfCalibration:
 
     Attributes:
         estimate: what is known now.
-        extrinsics: index of a pair or single camera -> covariance (6, 6) of its place relative to the first pair, see
+        extrinsics: index of a pair or single camera -> covariance (6, 6) of its pose relative to the first pair, see
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         widest: (C, C) covariance of what is known, if the file may be as wrong as any.
@@ -162,7 +162,7 @@ class SelfCalibration:
             return
         if self.is_trusted:
             if knocked := self._knocks.update(views, self._in_force):
-                self._forget_places(knocked)
+                self._forget_extrinsics(knocked)
             elif are_contradicting:
                 return
         self._agreeing += not are_contradicting
@@ -264,7 +264,7 @@ class SelfCalibration:
         """Discard a window that contradicts those before it; several such windows are a knock."""
         self._refused += is_full
         if self._refused >= _MAX_REFUSED:
-            self._forget_places(range(len(self._rig.groups)))
+            self._forget_extrinsics(range(len(self._rig.groups)))
 
     def _drop_pending(self) -> None:
         """Discard the window that is being adjusted, which is from before a break.
@@ -275,7 +275,7 @@ class SelfCalibration:
             wait([self._pending])
             self._pending = None
 
-    def _forget_places(self, groups: Iterable[int]) -> None:
+    def _forget_extrinsics(self, groups: Iterable[int]) -> None:
         """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
         self._drop_pending()
         change = knock_covariance(self._rig, len(self._walk), groups)

@@ -62,8 +62,8 @@ def slices_of_groups(rig: Rig) -> list[slice]:
     return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
 
 
-def place_of(rig: Rig, j: int) -> slice:
-    """Return where the parameters (6,) of the place in body of a pair's left camera, or of a single one, are."""
+def extrinsics_of(rig: Rig, j: int) -> slice:
+    """Return where the parameters (6,) of the extrinsics of a pair's left camera, or of a single one, are."""
     end = slices_of_groups(rig)[j].stop
     return slice(end - 6, end)
 
@@ -79,7 +79,7 @@ def has_coefficient(camera: Camera) -> Bool:
 
 
 def about_origin(rig: Rig, j: int) -> Float:
-    """Return the derivatives (6, 6) of d by the parameters of a place in body, where it is ``exp(d) body_T_left``."""
+    """Return the derivatives (6, 6) of d by the parameters of extrinsics, where these are ``exp(d) body_T_left``."""
     rows = np.eye(6)
     rows[3:, :3] = skew(rig.groups[j].left.body_T_cam[:3, 3])
     return rows
@@ -109,10 +109,10 @@ def depths_of_pair(rig: Rig, j: int) -> Float:
 def relative_to_first(rig: Rig, j: int) -> Float:
     """Return the derivatives (6, `n_of_cameras`) of a group's rotation and translation in body, seen from group 0.
 
-    Where body turns or moves against all cameras, their places in it change, and none of these differences does.
+    Where body turns or moves against all cameras, their extrinsics change, and none of these differences does.
     """
     rows = np.zeros((6, n_of_cameras(rig)))
-    first, own = rows[:, place_of(rig, 0)], rows[:, place_of(rig, j)]
+    first, own = rows[:, extrinsics_of(rig, 0)], rows[:, extrinsics_of(rig, j)]
     first -= np.eye(6)
     own += np.eye(6)
     first[3:, :3] += skew(rig.groups[j].left.body_T_cam[:3, 3] - rig.groups[0].left.body_T_cam[:3, 3])

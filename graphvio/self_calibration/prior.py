@@ -24,9 +24,9 @@ from graphvio.self_calibration.parameters import (
     INTRINSICS,
     STEREO,
     about_origin,
+    extrinsics_of,
     has_coefficient,
     n_of_cameras,
-    place_of,
     relative_to_first,
     slices_of_groups,
 )
@@ -39,7 +39,7 @@ SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX = 0.002, 1.0
 _BIAS_WALK_FACTOR = 2.0  # on the stated random walks, which are those of a sensor at one temperature
 
 
-_CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
+_CAMERAS, _EXTRINSICS, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
 
 
 def file_prior(rig: Rig) -> FilePrior:
@@ -51,13 +51,13 @@ def file_prior(rig: Rig) -> FilePrior:
     n = len(of_cameras)
     group = np.full(n, _CAMERAS)
     for j in range(len(rig.groups)):
-        group[place_of(rig, j)] = _PLACES
+        group[extrinsics_of(rig, j)] = _EXTRINSICS
     if rig.imu is None:
         return FilePrior(of_cameras, group)
     covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
     covariance[:n, :n] = of_cameras
     covariance[n:, n:] = np.diag(_sigmas_of_imu(rig.calibration_sigmas) ** 2)
-    of_imu = np.full(PARAMETERS, _PLACES)
+    of_imu = np.full(PARAMETERS, _EXTRINSICS)
     of_imu[:GYRO_MATRIX] = _NO_GROUP
     return FilePrior(covariance, np.concatenate([group, of_imu]))
 
@@ -79,7 +79,7 @@ def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
 
 
 def extrinsic_covariances(rig: Rig, covariance: Float) -> dict[int, Float]:
-    """Return the covariances of the places of pairs and single cameras relative to the first pair.
+    """Return the covariances of the extrinsics of pairs and single cameras relative to the first pair.
 
     Args:
         rig: G pairs and single cameras.
@@ -170,13 +170,13 @@ def _covariance_of_cameras(rig: Rig) -> Float:
     single = np.repeat([np.deg2rad(known.pair_rotation_deg), known.pair_translation_m], 3) ** 2
     by_common = np.zeros((len(covariance), 6))  # body turns about its origin, which moves the cameras in it
     for j, (group, sigmas) in enumerate(zip(rig.groups, own, strict=True)):
-        place = place_of(rig, j)
-        inner = slice(slices_of_groups(rig)[j].start, place.start)
+        extrinsics = extrinsics_of(rig, j)
+        inner = slice(slices_of_groups(rig)[j].start, extrinsics.start)
         covariance[inner, inner] = np.diag(np.maximum(sigmas, _MIN_SIGMA) ** 2)
-        by_common[place] = np.eye(6)
-        by_common[place][3:, :3] = -skew(group.left.body_T_cam[:3, 3])
+        by_common[extrinsics] = np.eye(6)
+        by_common[extrinsics][3:, :3] = -skew(group.left.body_T_cam[:3, 3])
         if j > 0:
-            covariance[place, place] = np.diag(single)
+            covariance[extrinsics, extrinsics] = np.diag(single)
     covariance += (by_common * common) @ by_common.T
     return covariance
 

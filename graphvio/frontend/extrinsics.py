@@ -16,10 +16,10 @@ from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.rig import Rig
 
 
-class Places:
+class RigExtrinsics:
     """Where pairs and single cameras are on the rig, and how well that is known.
 
-    Where self-calibration is on, it finds errors of the places, and they are not monitored here.
+    Where self-calibration is on, it finds errors of the extrinsics, and they are not monitored here.
 
     Args:
         rig: Stereo pairs and single cameras.
@@ -42,7 +42,7 @@ class Places:
         return {j: monitor.in_force for j, monitor in self._monitors.items() if monitor.in_force is not None}
 
     def recalibrate(self, rig: Rig, uncertain: Mapping[int, Float]) -> None:
-        """Take another calibration of the cameras, and covariances (6, 6) of places relative to the first pair's."""
+        """Take another calibration of the cameras, and covariances (6, 6) relative to the first pair's extrinsics."""
         self._nominal = RigArrays.of(rig)
         self.arrays = self._nominal
         self.uncertain = uncertain
@@ -51,7 +51,7 @@ class Places:
                 self._correct(j)
 
     def learn(self, own: Mapping[int, Refined]) -> None:
-        """Compare motions over a keyframe with the first pair's, and correct places that they refute."""
+        """Compare motions over a keyframe with the first pair's, and correct extrinsics that they refute."""
         if 0 not in own:
             return
         for j, monitor in self._monitors.items():
@@ -72,8 +72,8 @@ class Places:
         )
 
     def _correct(self, j: int) -> None:
-        """Apply the correction in force of one place, or none."""
+        """Apply the correction in force of one pair or single camera, or none."""
         monitor = self._monitors[j]
         self.arrays = self.arrays.corrected(self._nominal, j, monitor.correction)
-        others = {i: place for i, place in self.uncertain.items() if i != j}
+        others = {i: covariance for i, covariance in self.uncertain.items() if i != j}
         self.uncertain = others if monitor.in_force is None else {**others, j: monitor.in_force.covariance}
