@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float
 from graphvio.calibration.nuisances import ScaleMode
-from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair
+from graphvio.calibration.pair_calibration import SYSTEMATIC_POSE_COVARIANCE, PairCalibration, calibrate_pair
 from graphvio.calibration.segments import Segments, all_segments
 from graphvio.calibration.several import CameraExtrinsics, pairwise, place_all
 from graphvio.errors import CalibrationError
@@ -70,8 +70,8 @@ def test_place_all_errors_are_within_covariance_and_no_larger_than_pairwise() ->
         off = error(extrinsics)
         squares.append(off @ np.linalg.solve(extrinsics.covariance, off))
         ratios.append(
-            np.trace(covariance_between(extrinsics, 1, 2) - SEEN_FROM)
-            / np.trace(extrinsics.pairwise[1, 2].covariance - SEEN_FROM)
+            np.trace(covariance_between(extrinsics, 1, 2) - SYSTEMATIC_POSE_COVARIANCE)
+            / np.trace(extrinsics.pairwise[1, 2].covariance - SYSTEMATIC_POSE_COVARIANCE)
         )
         distances += extrinsics.distances.values()
         (loop,) = extrinsics.loops

@@ -137,7 +137,9 @@ def calibrate_trajectories(
         if (one, other) not in two:
             two[one, other] = aligned(trajectories[one], trajectories[other], same_clock, seed)
         both = two[one, other]
-        return calibrate_pair(both.segments, seed, nuisances=both.nuisances, scale_mode=mode, seen_from=_NO_ERROR)
+        return calibrate_pair(
+            both.segments, seed, nuisances=both.nuisances, scale_mode=mode, systematic_pose_covariance=_NO_ERROR
+        )
 
     found, missing = pairwise(names, calibrate, scale_mode)
     extrinsics = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _NO_ERROR)

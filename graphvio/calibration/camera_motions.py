@@ -50,7 +50,7 @@ class CameraMotions:
             covariance = to_left @ motion.covariance @ to_left.T
             if motion.shared_covariance.any():
                 shared = to_left @ motion.shared_covariance @ to_left.T
-                covariance = own_covariance(covariance, self._seen_from(motion.reference_stamp_ns, moved, shared))
+                covariance = own_covariance(covariance, self._view_covariance(motion.reference_stamp_ns, moved, shared))
             self._reference[motion.stamp_ns] = motion.reference_stamp_ns
             self._edge[motion.stamp_ns] = moved, covariance
 
@@ -139,7 +139,7 @@ class CameraMotions:
             motion = motion @ edge
         return motion, covariance
 
-    def _seen_from(self, reference_ns: int, moved: Float, shared: Float) -> Float:
+    def _view_covariance(self, reference_ns: int, moved: Float, shared: Float) -> Float:
         """Covariance of a reference's view, as given by its first motion, in the frame at a motion's end."""
         if reference_ns not in self._shared:
             self._shared[reference_ns] = _carried(shared, moved)

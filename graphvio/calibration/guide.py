@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.calibration import graph, paper_method
 from graphvio.calibration.camera_motions import CameraMotions
-from graphvio.calibration.pair_calibration import SEEN_FROM, systematic_covariance
+from graphvio.calibration.pair_calibration import SYSTEMATIC_POSE_COVARIANCE, systematic_covariance
 from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs
 from graphvio.errors import CalibrationError
 
@@ -98,7 +98,7 @@ class Guide:
         observability = found.observability
         # A solution from rotation about one axis may be wrong, and is no start for the next.
         self._left_T_left1[j] = found.left2_T_left1 if observability.is_complete else None
-        covariance = found.covariance + systematic_covariance(found.left2_T_left1, SEEN_FROM)
+        covariance = found.covariance + systematic_covariance(found.left2_T_left1, SYSTEMATIC_POSE_COVARIANCE)
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, translation = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])
         missing = "; ".join(observability.missing)

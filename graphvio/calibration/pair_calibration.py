@@ -19,7 +19,7 @@ from graphvio.calibration.segments import Segments, information_gains, most_info
 from graphvio.calibration.validation import Grown, Halves, alignment_lengths, dispersion, growth, halves, resampled
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
-SEEN_FROM = np.diag(np.repeat([4e-5, 1.5e-4], 3) ** 2)
+SYSTEMATIC_POSE_COVARIANCE = np.diag(np.repeat([4e-5, 1.5e-4], 3) ** 2)
 """Covariance (6, 6) of a camera's pose as its images see it: a fiftieth of a pixel, and what that is at the distance of
 a wall. All motions of a camera share this error, so no recording makes it smaller."""
 
@@ -144,7 +144,7 @@ def calibrate_pair(
     *,
     nuisances: Nuisances | None = None,
     scale_mode: ScaleMode = "auto",
-    seen_from: Float = SEEN_FROM,
+    systematic_pose_covariance: Float = SYSTEMATIC_POSE_COVARIANCE,
 ) -> PairCalibration:
     """Calibrate two pairs.
 
@@ -154,7 +154,7 @@ def calibrate_pair(
         nuisances: variables to estimate, too, with derivatives for all segments.
         scale_mode: ``estimate`` the ratio of the second camera's lengths to the first's as a variable, keep it
             ``fixed`` at 1, or ``auto``: estimate it where it differs significantly from 1.
-        seen_from: covariance (6, 6) of each camera's pose as its images see it.
+        systematic_pose_covariance: covariance (6, 6) of each camera's pose as its images see it.
 
     Raises:
         CalibrationError: if there are fewer than three pose pairs, the rig hardly turned, or no relative pose explains
@@ -186,7 +186,7 @@ def calibrate_pair(
         scale=checked,
         scale_estimated=estimate_scale,
         nuisances=nuisances,
-        floor=systematic_covariance(found.left2_T_left1, seen_from),
+        floor=systematic_covariance(found.left2_T_left1, systematic_pose_covariance),
         seed=seed,
     )
 
@@ -217,10 +217,10 @@ def _dispersion(pairs: PosePairs, found: GraphSolution, nuisances: Nuisances) ->
     return dispersion(inliers, errors, jacobians, determined)
 
 
-def systematic_covariance(left2_T_left1: Float, seen_from: Float) -> Float:
-    """Compute the covariance (6, 6) of the relative pose, tangent in left1, due to both cameras' `SEEN_FROM` errors."""
+def systematic_covariance(left2_T_left1: Float, systematic_pose_covariance: Float) -> Float:
+    """Compute the covariance (6, 6) of the relative pose, tangent in left1, due to both cameras' systematic errors."""
     adjoint = se3_adjoint(se3_inverse(left2_T_left1))
-    return np.asarray(seen_from + adjoint @ seen_from @ adjoint.T)
+    return np.asarray(systematic_pose_covariance + adjoint @ systematic_pose_covariance @ adjoint.T)
 
 
 def size_in_words(apart: Float) -> str:

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from graphvio.arrays import Float
 from graphvio.calibration import joint
 from graphvio.calibration.nuisances import ScaleMode
-from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, size_in_words
+from graphvio.calibration.pair_calibration import SYSTEMATIC_POSE_COVARIANCE, PairCalibration, size_in_words
 from graphvio.calibration.segments import Segments, information_gains, most_informative
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
@@ -86,7 +86,7 @@ def place_all(
     found: Mapping[tuple[int, int], PairCalibration],
     names: Sequence[str],
     segments: Segments,
-    seen_from: Float = SEEN_FROM,
+    systematic_pose_covariance: Float = SYSTEMATIC_POSE_COVARIANCE,
 ) -> CameraExtrinsics:
     """Find the poses that fit all motions at once.
 
@@ -94,7 +94,7 @@ def place_all(
         found: results for two cameras at a time, including those of the first camera and each other one.
         names: of J cameras.
         segments: of J cameras, all that may be chosen from.
-        seen_from: covariance (6, 6) of each camera's pose as its images see it.
+        systematic_pose_covariance: covariance (6, 6) of each camera's pose as its images see it.
 
     Raises:
         CalibrationError: if a camera agrees with the others in too few motions.
@@ -117,7 +117,9 @@ def place_all(
     held = [found[0, j].observability.undetermined for j in range(1, count)]
     solution = joint.solve(chosen, start, held)
     covariance = max(each.dispersion for each in found.values()) * solution.covariance
-    covariance = covariance + _systematic(solution.left_T_left1, seen_from) + _undetermined(found, count)
+    covariance = (
+        covariance + _systematic(solution.left_T_left1, systematic_pose_covariance) + _undetermined(found, count)
+    )
     apart = {(i, j): se3_log(se3_inverse(_in_first_lengths(found, i, j)) @ solution.between(i, j)) for i, j in found}
     distances = {
         cameras: float(apart[cameras] @ np.linalg.solve(each.covariance, apart[cameras]))
@@ -156,13 +158,13 @@ def _gains(segments: Segments, found: Mapping[tuple[int, int], PairCalibration],
     return gains
 
 
-def _systematic(left_T_left1: Float, seen_from: Float) -> Float:
+def _systematic(left_T_left1: Float, systematic_pose_covariance: Float) -> Float:
     """Covariance of all poses due to the cameras' systematic errors; that of the first camera is common to all."""
     others = len(left_T_left1) - 1
-    covariance = np.tile(seen_from, (others, others))
+    covariance = np.tile(systematic_pose_covariance, (others, others))
     for j in range(others):
         adjoint = se3_adjoint(se3_inverse(np.ascontiguousarray(left_T_left1[j + 1])))
-        covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] += adjoint @ seen_from @ adjoint.T
+        covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] += adjoint @ systematic_pose_covariance @ adjoint.T
     return covariance
 
 
