@@ -16,7 +16,7 @@ from graphvio.frontend.observations import Correspondences, Observations, RigArr
 from graphvio.frontend.pair_reports import pair_reports
 from graphvio.frontend.quality import StereoShare, graded, graded_hypothesis, stereo_share
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import joint_motion
+from graphvio.frontend.selection import joint_motion_known_depths
 from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.visual import VisualFrontend, _Seen
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
@@ -39,7 +39,7 @@ def agreement_of(
     uncertain: Mapping[int, Float] | None = None,
 ) -> Agreement:
     rng = np.random.default_rng(seed)
-    joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
+    joint = joint_motion_known_depths(arrays, seen, STILL, CONFIG, rng)
     return agree(arrays, seen, joint, CONFIG, rng, uncertain or {}, in_doubt)
 
 

@@ -15,10 +15,12 @@ from graphvio.frontend.refinement import Refined, explained, refine
 _MIN_SIGMAS = 3.0  # of a translation by whose flow depths are seen
 
 
-def joint_motion(
+def joint_motion_known_depths(
     rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> Refined:
-    """Estimate one motion from all pairs: hypotheses scored on every pair, the best one refined (section 3.1).
+    """Estimate one motion from all pairs, with depths as they are given (section 3.1).
+
+    Hypotheses are scored on every pair, and the best one is refined.
 
     Args:
         rig: of P pairs.
@@ -32,10 +34,10 @@ def joint_motion(
     return refine(rig, observations, search(rig, searched, predicted, config, rng), config)
 
 
-def joint_motion_with_vague_depths(
+def joint_motion(
     rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> tuple[Refined, Observations]:
-    """Estimate a motion as `joint_motion`, where single cameras' points may hardly have a depth yet.
+    """Estimate a motion as `joint_motion_known_depths`, where single cameras' points may hardly have a depth yet.
 
     The flow of such a point is any that the translation can explain. Where the translation is about zero, its error
     decides, and the minimum would lie where the noise of these points is explained best. So the motion is estimated
@@ -47,9 +49,9 @@ def joint_motion_with_vague_depths(
     """
     known = is_depth_known(rig, observations, config.pixel_sigma_px)
     if known.all() or known.sum() < config.min_inliers:
-        refined = joint_motion(rig, observations, predicted, config, rng)
+        refined = joint_motion_known_depths(rig, observations, predicted, config, rng)
         return with_unknown_scales(rig, observations, refined, config), observations
-    first = joint_motion(rig, observations.of_rows(known), predicted, config, rng)
+    first = joint_motion_known_depths(rig, observations.of_rows(known), predicted, config, rng)
     covariances, pair = observations.covariances.copy(), observations.pair[~known]
     covariances[~known] = _with_noise_of_motion(covariances[~known], pair, rig, first, config.pixel_sigma_px)
     observations = observations._replace(covariances=covariances)
@@ -82,9 +84,12 @@ def best_pair_motion(
 ) -> Refined:
     """Estimate a motion from each pair alone, and choose the one of least global cost, eq. (4).
 
-    For arguments see `joint_motion`; for the plain equation `graphvio.frontend.paper_method.best_pair`.
+    For arguments see `joint_motion_known_depths`; for the plain equation `graphvio.frontend.paper_method.best_pair`.
     """
-    candidates = [joint_motion(rig, observations.of_pair(pair), predicted, config, rng) for pair in observations.pairs]
+    candidates = [
+        joint_motion_known_depths(rig, observations.of_pair(pair), predicted, config, rng)
+        for pair in observations.pairs
+    ]
     costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
     winner = candidates[int(np.argmin(costs))]
     inlier, errors_px = explained(rig, observations, winner.cur_T_ref, config)

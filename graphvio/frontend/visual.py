@@ -25,7 +25,7 @@ from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.rolling_shutter import ReadoutMotion
-from graphvio.frontend.selection import best_pair_motion, joint_motion_with_vague_depths
+from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracker import PairTracker
@@ -264,7 +264,7 @@ class VisualFrontend:
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
             arrays = self._extrinsics.arrays
-            refined, observations = joint_motion_with_vague_depths(arrays, observations, start, config, rng)
+            refined, observations = joint_motion(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
             agreement = agree(
                 self._extrinsics.arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt
