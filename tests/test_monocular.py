@@ -27,7 +27,7 @@ from graphvio.live.source import SelectedCameras
 from graphvio.live.sources import open_live_source
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
-from graphvio.measurements.motion import Adopted, Elsewhere, Sighting
+from graphvio.measurements.motion import CameraTracks, CrossCameraMatches, HandedOverTracks
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import Measurements, adjust, covariance_of, equations, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
@@ -143,7 +143,7 @@ class Tracks:
         self._ids = [np.full(len(self._points), -1) for _ in self._cameras]
         self._next = 0
 
-    def sightings(self, t: float, share: float = 1.0) -> dict[int, Sighting]:
+    def camera_tracks(self, t: float, share: float = 1.0) -> dict[int, CameraTracks]:
         found = {}
         for j, camera in enumerate(self._cameras):
             odom_T_cam = self._flight.pose(t) @ camera.body_T_cam
@@ -161,7 +161,7 @@ class Tracks:
             rows = np.flatnonzero(self._ids[j] >= 0)
             rows = rows[np.argsort(ids[rows])]
             elsewhere = [self._elsewhere(t, k, rows) for k in range(len(self._cameras)) if self._shares and k != j]
-            found[j] = Sighting(ids[rows].astype(np.int64), self._rays(j, pixels[rows]), tuple(elsewhere))
+            found[j] = CameraTracks(ids[rows].astype(np.int64), self._rays(j, pixels[rows]), tuple(elsewhere))
         return found
 
     def points_of(self, j: int, t: float) -> dict[int, Float]:
@@ -173,13 +173,13 @@ class Tracks:
     def _rays(self, j: int, pixels: Float) -> Float:
         return self._lenses[j].unproject(pixels + PIXEL_SIGMA_PX * self._rng.normal(size=pixels.shape))[0]
 
-    def _elsewhere(self, t: float, k: int, rows: Int) -> Elsewhere:
+    def _elsewhere(self, t: float, k: int, rows: Int) -> CrossCameraMatches:
         """See points in another camera."""
         odom_T_cam = self._flight.pose(t) @ self._cameras[k].body_T_cam
         pixels, seen = self._cameras[k].project((self._points[rows] - odom_T_cam[:3, 3]) @ odom_T_cam[:3, :3])
         is_wrong = (rows * 0.618034) % 1.0 < self._mismatched
         pixels[is_wrong, 0] += np.where(rows[is_wrong] % 2, 12.0, -12.0)  # along the epipolar line
-        return Elsewhere(k, np.flatnonzero(seen), self._rays(k, pixels[seen]))
+        return CrossCameraMatches(k, np.flatnonzero(seen), self._rays(k, pixels[seen]))
 
 
 class Flown(NamedTuple):
@@ -242,7 +242,7 @@ def fly(
             estimator.predict(stamp_ns, None)
         else:
             estimator.initialise(stamp_ns, (SimpleNamespace(**_still_interval()), 0.0))  # type: ignore[arg-type]
-        visual = SimpleNamespace(sightings=tracks.sightings(t, 1.0 if share is None else share(t)))
+        visual = SimpleNamespace(camera_tracks=tracks.camera_tracks(t, 1.0 if share is None else share(t)))
         estimator.apply(visual, is_still)  # type: ignore[arg-type]
         keep = frozenset({stamp_ns} if k % 3 == 0 and not is_still else set())
         statuses.append(estimator.update(stamp_ns, is_constrained=False, keep=keep).status)
@@ -281,11 +281,13 @@ def aligned(flown: Flown) -> tuple[float, float]:
 # ------------------------------------------------------------------ landmarks
 
 
-def seen(ids: list[int], adopted: Adopted | None = None, elsewhere: tuple[Elsewhere, ...] = ()) -> Sighting:
+def seen(
+    ids: list[int], adopted: HandedOverTracks | None = None, elsewhere: tuple[CrossCameraMatches, ...] = ()
+) -> CameraTracks:
     """Return tracks, each with its identity for its place."""
     rays = np.tile(np.array(ids, dtype=float)[:, None], 2)
     nothing = np.zeros(0, dtype=np.int64)
-    return Sighting(np.array(ids), rays, elsewhere, adopted or Adopted(nothing, nothing, nothing))
+    return CameraTracks(np.array(ids), rays, elsewhere, adopted or HandedOverTracks(nothing, nothing, nothing))
 
 
 def test_tracks_of_several_cameras_that_follow_one_point_are_one_landmark_with_one_view_by_each() -> None:
@@ -293,11 +295,11 @@ def test_tracks_of_several_cameras_that_follow_one_point_are_one_landmark_with_o
     first = names.join({0: seen([3, 4]), 1: seen([0])})
     assert len(set(first.landmark.tolist())) == 3
     point = first.landmark[first.ids == 4][0]
-    adopted = Adopted(np.array([1]), np.array([0]), np.array([4]))  # the second camera's second track
+    adopted = HandedOverTracks(np.array([1]), np.array([0]), np.array([4]))  # the second camera's second track
     both = names.join(
         {
-            0: seen([3, 4], elsewhere=(Elsewhere(1, np.array([1]), np.array([[-1.0, -1.0]])),)),
-            1: seen([0, 7], adopted, (Elsewhere(0, np.array([1]), np.array([[-2.0, -2.0]])),)),
+            0: seen([3, 4], elsewhere=(CrossCameraMatches(1, np.array([1]), np.array([[-1.0, -1.0]])),)),
+            1: seen([0, 7], adopted, (CrossCameraMatches(0, np.array([1]), np.array([[-2.0, -2.0]])),)),
         }
     )
     of_point = both.landmark == point
@@ -360,7 +362,7 @@ def problem(
     cameras = Cameras.of(rig)
     tracks, landmarks = Tracks(rig, flight, shares), Landmarks()
     names = LandmarkNames(len(rig.singles), n_keyframes)
-    views = [names.join(tracks.sightings(t, 0.3)) for t in times]
+    views = [names.join(tracks.camera_tracks(t, 0.3)) for t in times]
     structure, places, _ = landmarks.structure(views, states.poses, cameras)
     places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
     measured = Measurements(cameras, structure, PIXEL_SIGMA_PX, samples, np.zeros(0, dtype=np.int64))

@@ -81,27 +81,27 @@ def surround_walk() -> SurroundWalk:
         since = {int(then): np.ascontiguousarray(now_T_world @ pose) for then, pose in zip(stamps, poses, strict=True)}
         visual = frontend.process(simulator.frameset(k), since.__getitem__)
         frames = frontend.frames_at(stamps[k])
-        for j, sighting in visual.sightings.items():
+        for j, tracks in visual.camera_tracks.items():
             depth, world_T_cam = simulator.view(k, j).depth, poses[k] @ cameras[j].body_T_cam
-            rows, begun_by, begun_as = sighting.adopted
+            rows, begun_by, begun_as = tracks.handed_over
             columns, lines = np.rint(frames[j].pixels).astype(int).T
             points = np.column_stack([frames[j].left, np.ones(len(columns))]) * depth[lines, columns][:, None]
             points = points @ world_T_cam[:3, :3].T + world_T_cam[:3, 3]
             own = np.setdiff1d(np.arange(len(columns)), rows)
-            in_world |= {(j, int(sighting.ids[i])): points[i] for i in own}
+            in_world |= {(j, int(tracks.ids[i])): points[i] for i in own}
             origins = list(zip(begun_by.tolist(), begun_as.tolist(), strict=True))
             twice += len(origins) - len(set(origins))
             for row, origin in zip(rows, origins, strict=True):
-                if sighting.ids[row] not in known[j]:
+                if tracks.ids[row] not in known[j]:
                     others = np.delete(frames[j].pixels, row, axis=0)
                     apart_px.append(np.linalg.norm(others - frames[j].pixels[row], axis=1).min())
-                track = (j, int(sighting.ids[row]))
-                if origin[1] in visual.sightings[origin[0]].ids or track in over:
+                track = (j, int(tracks.ids[row]))
+                if origin[1] in visual.camera_tracks[origin[0]].ids or track in over:
                     continue
                 over.add(track)
                 in_cam = (in_world[origin] - world_T_cam[:3, 3]) @ world_T_cam[:3, :3]
                 distances_px.append(np.linalg.norm(cameras[j].project(in_cam[None])[0][0] - frames[j].pixels[row]))
-            known[j] = np.union1d(known[j], sighting.ids)
+            known[j] = np.union1d(known[j], tracks.ids)
     frontend.close()
     return SurroundWalk(np.array(distances_px), min(apart_px), twice)
 
@@ -119,16 +119,16 @@ def test_tracks_are_found_where_other_cameras_see_their_points(
     for k in range(2):
         visual = frontend.process(simulator.frameset(k), lambda _: np.eye(4))
         errors, found = [], 0
-        for j, sighting in visual.sightings.items():
+        for j, tracks in visual.camera_tracks.items():
             frame = frontend.frames_at(simulator.stamps_ns[0] if k == 0 else simulator.stamps_ns[1])[j]
             columns, rows = np.rint(frame.pixels).astype(int).T
-            for seen in sighting.elsewhere:
+            for seen in tracks.matches:
                 assert overlap(cameras[j], cameras[seen.camera]) >= MIN_OVERLAP
                 assert make_rig is not surrounding or axes_angle_deg(cameras[j], cameras[seen.camera]) > 45.0
                 of_own = depths[j][rows[seen.rows], columns[seen.rows]]
                 other = cameras[seen.camera]
                 in_other = np.column_stack([seen.rays, np.ones(len(seen.rays))])
-                expected = true_pixels(cameras[j], sighting.rays[seen.rows], of_own, other)
+                expected = true_pixels(cameras[j], tracks.rays[seen.rows], of_own, other)
                 errors.append(np.linalg.norm(other.project(in_other)[0] - expected, axis=1))
                 found += len(seen.rows)
         assert np.median(np.concatenate(errors)) < max_median_px
@@ -143,12 +143,12 @@ def test_rolling_shutters_and_cameras_that_look_apart_share_nothing() -> None:
     rig = phone().with_cameras(half_size)
     simulator = OnceRendered(build_scene("room", 1.0), rig, 1)
     frontend = SinglesFrontend(rig, Config())
-    assert frontend.process(simulator.frameset(0), lambda _: None).sightings[0].elsewhere == ()
+    assert frontend.process(simulator.frameset(0), lambda _: None).camera_tracks[0].matches == ()
     frontend.close()
     apart = default_rig().with_only(["cam0", "cam2"]).with_cameras(half_size)
     frontend = SinglesFrontend(apart, Config())
     frameset = OnceRendered(build_scene("room", 1.0), apart, 1).frameset(0)
-    assert all(each.elsewhere == () for each in frontend.process(frameset, lambda _: None).sightings.values())
+    assert all(each.matches == () for each in frontend.process(frameset, lambda _: None).camera_tracks.values())
     frontend.close()
 
 

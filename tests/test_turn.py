@@ -9,7 +9,7 @@ from numpy.random import Generator
 from graphvio.arrays import Float
 from graphvio.frontend.turn import turn_between
 from graphvio.geometry import se3, se3_inverse, so3_exp, so3_log
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.simulation.named_rigs import stereo_and_back
 
 NOISE_PX = 0.2
@@ -30,11 +30,11 @@ def wall(rng: Generator, count: int = 150) -> Float:
     return points @ body_T_cam[:3, :3].T + body_T_cam[:3, 3]
 
 
-def sighting(points: Float, world_T_body: Float, rng: Generator) -> Sighting:
+def camera_tracks(points: Float, world_T_body: Float, rng: Generator) -> CameraTracks:
     cam_T_world = RIG.cameras[0].cam_T_body @ se3_inverse(world_T_body)
     seen = points @ cam_T_world[:3, :3].T + cam_T_world[:3, 3]
     noise = NOISE_PX / RIG.cameras[0].focal_px * rng.standard_normal((len(points), 2))
-    return Sighting(np.arange(len(points)), seen[:, :2] / seen[:, 2:] + noise)
+    return CameraTracks(np.arange(len(points)), seen[:, :2] / seen[:, 2:] + noise)
 
 
 MOTIONS = [
@@ -50,8 +50,8 @@ def test_turn_between_is_that_of_body(turn: Float, step_m: Float) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         points = scene(rng)
-        then = sighting(points, np.eye(4), rng)
-        now = sighting(points, se3(so3_exp(turn), step_m), rng)
+        then = camera_tracks(points, np.eye(4), rng)
+        now = camera_tracks(points, se3(so3_exp(turn), step_m), rng)
         found = turn_between(RIG, {0: then}, {0: now})
         if found is not None:
             errors.append(np.linalg.norm(so3_log(np.ascontiguousarray(found @ so3_exp(turn).T))))
@@ -63,9 +63,9 @@ def test_turn_between_is_that_of_body(turn: Float, step_m: Float) -> None:
 def test_turn_between_ignores_tracks_of_what_moves() -> None:
     rng = np.random.default_rng(5)
     points, turn = scene(rng), np.array([0.0, 0.0, 0.04])
-    then = sighting(points, np.eye(4), rng)
+    then = camera_tracks(points, np.eye(4), rng)
     points[:40] += np.array([0.3, 0.2, 0.1])
-    now = sighting(points, se3(so3_exp(turn), np.array([0.08, 0.0, 0.02])), rng)
+    now = camera_tracks(points, se3(so3_exp(turn), np.array([0.08, 0.0, 0.02])), rng)
     found = turn_between(RIG, {0: then}, {0: now})
     assert found is not None
     np.testing.assert_allclose(found, so3_exp(turn), atol=0.004)
@@ -75,15 +75,15 @@ def test_turn_between_in_front_of_a_wall_is_unknown() -> None:
     """A plane has two essential matrices, and each of them fits."""
     rng = np.random.default_rng(6)
     points = wall(rng)
-    then = sighting(points, np.eye(4), rng)
-    now = sighting(points, se3(so3_exp(np.array([0.0, 0.0, 0.05])), np.array([0.0, 0.2, 0.1])), rng)
+    then = camera_tracks(points, np.eye(4), rng)
+    now = camera_tracks(points, se3(so3_exp(np.array([0.0, 0.0, 0.05])), np.array([0.0, 0.2, 0.1])), rng)
     assert turn_between(RIG, {0: then}, {0: now}) is None
 
 
 def test_turn_between_needs_tracks_in_common() -> None:
     rng = np.random.default_rng(7)
-    seen = sighting(scene(rng, count=20), np.eye(4), rng)
-    other = sighting(scene(rng), np.eye(4), rng)._replace(ids=np.arange(1000, 1150))
+    seen = camera_tracks(scene(rng, count=20), np.eye(4), rng)
+    other = camera_tracks(scene(rng), np.eye(4), rng)._replace(ids=np.arange(1000, 1150))
     assert turn_between(RIG, {0: seen}, {0: seen}) is None
     assert turn_between(RIG, {0: other}, {0: seen}) is None
     assert turn_between(RIG, {}, {0: seen}) is None

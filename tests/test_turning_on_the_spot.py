@@ -10,7 +10,7 @@ from graphvio import ImuSample, Odometry
 from graphvio.arrays import Float
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import EventKind
-from graphvio.measurements.motion import Sighting, VisualResult
+from graphvio.measurements.motion import CameraTracks, VisualResult
 from graphvio.simulation import build_scene, default_rig
 from graphvio.simulation.motion import Motion
 from graphvio.simulation.simulator import Simulator
@@ -23,7 +23,7 @@ MAX_PARALLAX = 0.02  # rad from image to image: the camera is 0.18 m from body's
 class Turned(NamedTuple):
     statuses: list[Status]
     kinds: list[str]
-    sightings: list[Sighting]
+    camera_tracks: list[CameraTracks]
     world_R_cam: Float  # (N, 3, 3), true
 
 
@@ -42,11 +42,11 @@ def turned() -> Turned:
     scene = replace(build_scene("room"), motion=Motion(course, DURATION_S))
     rig = default_rig().with_only(["cam0"])
     simulator, odometry = Simulator(scene, rig), Odometry(rig)
-    process, sightings = odometry._frontend.process, list[Sighting]()
+    process, camera_tracks = odometry._frontend.process, list[CameraTracks]()
 
     def listened(*args: object) -> VisualResult:
         visual = process(*args)  # type: ignore[arg-type]
-        sightings.append(visual.sightings[0])
+        camera_tracks.append(visual.camera_tracks[0])
         return visual
 
     odometry._frontend.process = listened  # type: ignore[method-assign,assignment]
@@ -59,14 +59,14 @@ def turned() -> Turned:
         estimates.append(odometry.process(simulator.frameset(k)))
     world_R_cam = simulator.world_T_body[:, :3, :3] @ rig.cameras[0].body_T_cam[:3, :3]
     statuses = [estimate.status for estimate in estimates if estimate is not None]
-    return Turned(statuses, [event.kind for event in odometry.take_events()], sightings, world_R_cam)
+    return Turned(statuses, [event.kind for event in odometry.take_events()], camera_tracks, world_R_cam)
 
 
 def test_tracks_of_a_camera_that_turns_end_where_their_points_leave_the_image(turned: Turned) -> None:
     """Next to the edge of the image, something similar would be found instead, again in each image."""
     n_tracks, n_wrong = 0, 0
-    for k in range(len(turned.sightings) - 1):
-        before, now = turned.sightings[k : k + 2]
+    for k in range(len(turned.camera_tracks) - 1):
+        before, now = turned.camera_tracks[k : k + 2]
         _, rows_before, rows_now = np.intersect1d(before.ids, now.ids, return_indices=True)
         directions = [
             np.column_stack([each.rays[rows], np.ones(len(rows))]) @ turned.world_R_cam[at].T

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.frontend.tracks import PairFrame
-from graphvio.measurements.motion import Adopted
+from graphvio.measurements.motion import HandedOverTracks
 
 if TYPE_CHECKING:
     from graphvio.frontend.tracker import PairTracker
@@ -60,19 +60,19 @@ class Handover:
 
     def __init__(self, n_cameras: int) -> None:
         none = np.zeros(0, dtype=np.int64)
-        self._adopted = [Adopted(none, none, none) for _ in range(n_cameras)]  # whose rows are identities
+        self._handed_over = [HandedOverTracks(none, none, none) for _ in range(n_cameras)]  # whose rows are identities
 
-    def adopted(self, camera: int, frame: PairFrame) -> Adopted:
+    def handed_over(self, camera: int, frame: PairFrame) -> HandedOverTracks:
         """Return the tracks of a frame that follow points of other cameras' tracks."""
-        known = self._adopted[camera]
+        known = self._handed_over[camera]
         at = np.minimum(np.searchsorted(frame.ids, known.rows), max(len(frame.ids) - 1, 0))
         stays = frame.ids[at] == known.rows if len(frame.ids) else np.zeros(len(at), dtype=bool)
-        self._adopted[camera] = known = Adopted(*(column[stays] for column in known))
+        self._handed_over[camera] = known = HandedOverTracks(*(column[stays] for column in known))
         return known._replace(rows=at[stays])
 
     def is_followed(self, camera: int, frames: Mapping[int, PairFrame]) -> Bool:
         """Select the tracks (N,) of a camera whose point is still in the view of the camera that began it."""
-        rows, cameras, ids = self.adopted(camera, frames[camera])
+        rows, cameras, ids = self.handed_over(camera, frames[camera])
         followed = np.zeros(len(frames[camera].ids), dtype=bool)
         for k in np.unique(cameras):
             if int(k) in frames:
@@ -94,12 +94,12 @@ class Handover:
         Returns:
             The camera's tracks.
         """
-        own = self.adopted(camera, frames[camera])
+        own = self.handed_over(camera, frames[camera])
         followed = set(zip(own.cameras.tolist(), own.ids.tolist(), strict=True))
         followed |= {(camera, int(i)) for i in frames[camera].ids}
         pixels, inverse_depths, origins = [], [], []
         for each in found:
-            theirs, their_ids = self.adopted(each.camera, frames[each.camera]), frames[each.camera].ids
+            theirs, their_ids = self.handed_over(each.camera, frames[each.camera]), frames[each.camera].ids
             begun_by = zip(theirs.cameras.tolist(), theirs.ids.tolist(), strict=True)
             begun = dict(zip(their_ids[theirs.rows].tolist(), begun_by, strict=True))
             for i, track in enumerate(each.ids.tolist()):
@@ -113,7 +113,7 @@ class Handover:
             return frames[camera]
         frame, rows = tracker.adopt(np.array(pixels), np.array(inverse_depths))
         by, ids = np.array(origins, dtype=np.int64)[rows].T
-        new = Adopted(frame.ids[len(frame.ids) - len(rows) :], by, ids)
-        both = zip(self._adopted[camera], new, strict=True)
-        self._adopted[camera] = Adopted(*(np.concatenate(columns) for columns in both))
+        new = HandedOverTracks(frame.ids[len(frame.ids) - len(rows) :], by, ids)
+        both = zip(self._handed_over[camera], new, strict=True)
+        self._handed_over[camera] = HandedOverTracks(*(np.concatenate(columns) for columns in both))
         return frame

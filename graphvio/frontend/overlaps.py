@@ -16,7 +16,7 @@ from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.warped_matching import WarpedMatcher
-from graphvio.measurements.motion import Elsewhere
+from graphvio.measurements.motion import CrossCameraMatches
 from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, StereoPair, axes_angle_deg, overlap
 
 if TYPE_CHECKING:
@@ -113,14 +113,14 @@ class Overlaps:
             if partner.camera in views:
                 self._find(partner, own, views[partner.camera], cam_T_before, searches, wanted)
 
-    def elsewhere(self, camera: int, frame: PairFrame) -> tuple[Elsewhere, ...]:
+    def matches_of(self, camera: int, frame: PairFrame) -> tuple[CrossCameraMatches, ...]:
         """Return where other cameras see the tracks of a camera's newest frame."""
         found = []
         for partner in self._partners[camera]:
             if partner.found.stamp_ns == frame.stamp_ns:
                 there = partner.found
                 rows = np.searchsorted(frame.ids, there.ids)
-                found.append(Elsewhere(partner.camera, rows, there.right))
+                found.append(CrossCameraMatches(partner.camera, rows, there.right))
         return tuple(found)
 
     def found_in(self, camera: int, stamp_ns: int, leaving: Mapping[int, Leaving]) -> list[FoundThere]:

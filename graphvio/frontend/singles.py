@@ -15,7 +15,7 @@ from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.frontend.visual import MotionPredictor, VisualFrontend
-from graphvio.measurements.motion import PairReport, Quality, Sighting, VisualResult
+from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.timing import timed
@@ -68,12 +68,12 @@ class SinglesFrontend(VisualFrontend):
             cur_T_reference = None if reference is None else predict(reference.stamp_ns)
             if reference is not None and cur_T_reference is not None:
                 self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
-        sightings = self._find_elsewhere(seen.frames, predict, is_keyframe)
+        camera_tracks = self._match_across_cameras(seen.frames, predict, is_keyframe)
         if is_keyframe:
             before = seen.frames
             seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
             new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
-            sightings = self._find_elsewhere(seen.frames, predict, is_keyframe, new)
+            camera_tracks = self._match_across_cameras(seen.frames, predict, is_keyframe, new)
             for j in seen.frames:
                 self._overlaps.slant(j, self._trackers[j])
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
@@ -86,14 +86,14 @@ class SinglesFrontend(VisualFrontend):
             is_stationary=is_stationary,
             frozen=seen.frozen.pairs,
             stage_ms=self.stage_ms,
-            sightings={} if self._all_frozen else sightings,
+            camera_tracks={} if self._all_frozen else camera_tracks,
         )
 
     @timed("elsewhere")
-    def _find_elsewhere(
+    def _match_across_cameras(
         self, frames: dict[int, PairFrame], predict: MotionPredictor, searches: bool,
         wanted: Mapping[int, Bool] | None = None,
-    ) -> dict[int, Sighting]:  # fmt: skip
+    ) -> dict[int, CameraTracks]:  # fmt: skip
         """Find each camera's tracks in the other cameras that see the same part of the scene.
 
         Those that another camera's track is a part of are found by that one.
@@ -103,11 +103,11 @@ class SinglesFrontend(VisualFrontend):
         if not searches:
             of_others = {j: self._handover.is_followed(j, frames) for j in frames}
 
-        def find(j: int) -> Sighting:
+        def find(j: int) -> CameraTracks:
             chosen = ~of_others[j] if wanted is None else wanted[j]
             self._overlaps.find(j, views, lambda then_ns: self._moved(j, predict(then_ns)), searches, chosen)
-            adopted = self._handover.adopted(j, frames[j])
-            return Sighting(frames[j].ids, frames[j].left, self._overlaps.elsewhere(j, frames[j]), adopted)
+            handed_over = self._handover.handed_over(j, frames[j])
+            return CameraTracks(frames[j].ids, frames[j].left, self._overlaps.matches_of(j, frames[j]), handed_over)
 
         return self._in_parallel(find, frames)
 

@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import so3_log
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.rig import Rig
 
 _MIN_TRACKS = 30
@@ -22,7 +22,7 @@ _MAX_OFF_PLANE_PX = 0.7
 _MAX_IN_PLANE = 0.85  # share of the tracks that fit: a plane has two essential matrices, with different rotations
 
 
-def turn_between(rig: Rig, then: Mapping[int, Sighting], now: Mapping[int, Sighting]) -> Float | None:
+def turn_between(rig: Rig, then: Mapping[int, CameraTracks], now: Mapping[int, CameraTracks]) -> Float | None:
     """Measure the rotation ``then_R_now`` (3, 3) of body by the essential matrix of the camera with most tracks.
 
     Args:
@@ -59,7 +59,7 @@ def turn_between(rig: Rig, then: Mapping[int, Sighting], now: Mapping[int, Sight
     return np.asarray(body_R_cam @ now_R_then.T @ body_R_cam.T)
 
 
-def _tracks(then: Sighting, now: Sighting) -> tuple[Float, Float]:
+def _tracks(then: CameraTracks, now: CameraTracks) -> tuple[Float, Float]:
     """Return the rays (N, 2) and (N, 2) of the tracks that both have."""
     first, second = common_rows(then.ids, now.ids)
     before, after = then.rays[first], now.rays[second]

@@ -94,7 +94,7 @@ class RelativeMotion:
         return float(rotation), float(translation)
 
 
-class Elsewhere(NamedTuple):
+class CrossCameraMatches(NamedTuple):
     """Where another camera sees tracks of a single camera at the same instant.
 
     Attributes:
@@ -108,7 +108,7 @@ class Elsewhere(NamedTuple):
     rays: Float
 
 
-class Adopted(NamedTuple):
+class HandedOverTracks(NamedTuple):
     """Tracks of a single camera that follow points which another camera's tracks began.
 
     Attributes:
@@ -122,23 +122,23 @@ class Adopted(NamedTuple):
     ids: Int
 
 
-_NONE_ADOPTED = Adopted(*(np.zeros(0, dtype=np.int64) for _ in range(3)))
+_NONE_HANDED_OVER = HandedOverTracks(*(np.zeros(0, dtype=np.int64) for _ in range(3)))
 
 
-class Sighting(NamedTuple):
+class CameraTracks(NamedTuple):
     """What one single camera sees at an instant.
 
     Attributes:
         ids: (N,) identities of its tracks, increasing.
         rays: (N, 2) normalised coordinates.
-        elsewhere: the same tracks in other cameras whose views overlap.
-        adopted: which of them follow points of other cameras' tracks.
+        matches: the same tracks in other cameras whose views overlap.
+        handed_over: which of them follow points of other cameras' tracks.
     """
 
     ids: Int
     rays: Float
-    elsewhere: tuple[Elsewhere, ...] = ()
-    adopted: Adopted = _NONE_ADOPTED
+    matches: tuple[CrossCameraMatches, ...] = ()
+    handed_over: HandedOverTracks = _NONE_HANDED_OVER
 
 
 class LocatedPoints(NamedTuple):
@@ -168,7 +168,7 @@ class VisualResult:
         own: At the end of a keyframe, pair index -> its own motion of body by the rig's extrinsics.
         is_stationary: Whether the images have shown no motion for a while.
         frozen: Pairs that were left out because a camera of theirs repeats an image.
-        sightings: Of a rig without pairs, camera index -> its tracks; the back-end then measures the motion.
+        camera_tracks: Of a rig without pairs, camera index -> its tracks; the back-end then measures the motion.
         stage_ms: Processing time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
             ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``quality``, and
             ``replenish``, which is next to nothing unless the reference changes.
@@ -183,4 +183,4 @@ class VisualResult:
     is_stationary: bool = False
     frozen: frozenset[int] = frozenset()
     stage_ms: Mapping[str, float] = field(default_factory=dict)
-    sightings: Mapping[int, Sighting] = field(default_factory=dict)
+    camera_tracks: Mapping[int, CameraTracks] = field(default_factory=dict)

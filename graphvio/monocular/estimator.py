@@ -21,7 +21,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import LocatedPoints, Sighting, VisualResult
+from graphvio.measurements.motion import CameraTracks, LocatedPoints, VisualResult
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.initialiser import MAX_DURATION_NS, Initialiser, shared_points
@@ -70,7 +70,7 @@ class MonocularEstimator:
         self._is_reported = False
         self._is_keyframe = True  # the newest state of the window
         self._before: tuple[int, Float] | None = None  # the state before the newest one, where it has left the window
-        self._sightings: dict[int, Sighting] = {}
+        self._camera_tracks: dict[int, CameraTracks] = {}
         self._is_stationary = False
         self._tracked_sigma_m = 0.0
         self._contradicted_since_ns: int | None = None
@@ -212,9 +212,9 @@ class MonocularEstimator:
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Take what the cameras see; it is tested when the window is solved."""
-        self._has_overlaps |= shared_points(visual.sightings) > 0
-        seen = dict(visual.sightings) if self._are_trusted else alone(visual.sightings)
-        self._sightings, self._is_stationary = seen, is_stationary
+        self._has_overlaps |= shared_points(visual.camera_tracks) > 0
+        seen = dict(visual.camera_tracks) if self._are_trusted else alone(visual.camera_tracks)
+        self._camera_tracks, self._is_stationary = seen, is_stationary
         return MeasurementUpdate(None)
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
@@ -236,7 +236,7 @@ class MonocularEstimator:
     def _initialising(self, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Collect keyframes, and begin the window once the scale is known."""
         if self._has_imu and not self._is_imu_doubted and (is_keyframe or self._is_stationary):
-            window = self._initialiser.add(stamp_ns, self._sightings, self._is_stationary)
+            window = self._initialiser.add(stamp_ns, self._camera_tracks, self._is_stationary)
             instead = self._without_overlaps(stamp_ns, window)
             if instead is not None:
                 return self._begin(instead, stamp_ns, is_keyframe)
@@ -278,7 +278,7 @@ class MonocularEstimator:
         if not (self._has_overlaps and self._are_trusted and is_exact):
             return None
         states = None if window is None else window.states
-        found = self._trust.add(stamp_ns, self._sightings, self._is_stationary, states)
+        found = self._trust.add(stamp_ns, self._camera_tracks, self._is_stationary, states)
         if found is None:
             return None
         instead, why = found
@@ -290,7 +290,7 @@ class MonocularEstimator:
 
     def _solve(self, window: Window, stamp_ns: int, is_keyframe: bool, is_new: bool = False) -> StateUpdate:
         if not is_new:
-            window.add_views(self._sightings, self._is_stationary)
+            window.add_views(self._camera_tracks, self._is_stationary)
         self._is_keyframe = is_keyframe
         solution = self._solver.solve(window, stamp_ns, is_keyframe)
         return StateUpdate(self._status(stamp_ns, solution), outliers=solution.dropped)

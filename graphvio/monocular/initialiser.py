@@ -17,7 +17,7 @@ from graphvio.arrays import Float
 from graphvio.backend.initialisation import level
 from graphvio.errors import MeasurementError
 from graphvio.geometry import se3, se3_inverse
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, evidence_of, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
@@ -51,7 +51,7 @@ POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
 
 class _Keyframe(NamedTuple):
     stamp_ns: int
-    sightings: Mapping[int, Sighting]
+    camera_tracks: Mapping[int, CameraTracks]
     is_stationary: bool
 
 
@@ -96,16 +96,16 @@ class Initialiser:
         """Stamp of the first keyframe, or None."""
         return self._keyframes[0].stamp_ns if self._keyframes else None
 
-    def add(self, stamp_ns: int, sightings: Mapping[int, Sighting], is_stationary: bool) -> Window | None:
+    def add(self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool) -> Window | None:
         """Take a keyframe, and return the window if its scale is known."""
         if is_stationary and self._keyframes and self._keyframes[-1].is_stationary:
             self._keyframes.pop()  # of a standstill the newest keyframe stays
-        self._keyframes.append(_Keyframe(stamp_ns, sightings, is_stationary))
+        self._keyframes.append(_Keyframe(stamp_ns, camera_tracks, is_stationary))
         del self._keyframes[:-MAX_KEYFRAMES]
         while stamp_ns - self._keyframes[0].stamp_ns > MAX_DURATION_NS:
             del self._keyframes[0]
         duration_s = (stamp_ns - self._keyframes[0].stamp_ns) * 1e-9
-        is_metric = shared_points(sightings) >= _MIN_LANDMARKS
+        is_metric = shared_points(camera_tracks) >= _MIN_LANDMARKS
         min_keyframes = _MIN_METRIC_KEYFRAMES if is_metric else _MIN_KEYFRAMES
         min_duration_s = _MIN_METRIC_DURATION_S if is_metric else _MIN_DURATION_S
         if is_stationary or len(self._keyframes) < min_keyframes or duration_s < min_duration_s:
@@ -141,7 +141,7 @@ class Initialiser:
         names = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1)
         views = []
         for keyframe in keyframes:
-            views.append(names.join(keyframe.sightings))
+            views.append(names.join(keyframe.camera_tracks))
             names.note_keyframe()
         states = self._first_states(samples, views, file)
         if states is None:
@@ -253,9 +253,9 @@ class Initialiser:
         return replace(window, states=turned, prior=window.prior._replace(at=at))
 
 
-def shared_points(sightings: Mapping[int, Sighting]) -> int:
+def shared_points(camera_tracks: Mapping[int, CameraTracks]) -> int:
     """Count the points that two cameras see."""
-    return sum(len(seen.rows) for sighting in sightings.values() for seen in sighting.elsewhere)
+    return sum(len(seen.rows) for tracks in camera_tracks.values() for seen in tracks.matches)
 
 
 def _ambiguity(adjusted: Adjusted, prior: Prior, file: Gaussian | None) -> str:

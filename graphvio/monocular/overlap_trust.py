@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.initialiser import Initialiser
 from graphvio.monocular.states import States
 from graphvio.monocular.window import Window
@@ -24,9 +24,9 @@ _SUFFICIENT_SIGMA = 0.01  # of the scale by the IMU
 _MAX_COMPARISONS = 8  # each takes as long as an initialisation
 
 
-def alone(sightings: Mapping[int, Sighting]) -> dict[int, Sighting]:
+def alone(camera_tracks: Mapping[int, CameraTracks]) -> dict[int, CameraTracks]:
     """Return what each camera sees by itself."""
-    return {j: Sighting(sighting.ids, sighting.rays) for j, sighting in sightings.items()}
+    return {j: CameraTracks(tracks.ids, tracks.rays) for j, tracks in camera_tracks.items()}
 
 
 class OverlapTrust:
@@ -51,13 +51,13 @@ class OverlapTrust:
             self._initialiser.know_gyro_bias(gyro_bias, sigma)
 
     def add(
-        self, stamp_ns: int, sightings: Mapping[int, Sighting], is_stationary: bool, states: States | None
+        self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool, states: States | None
     ) -> tuple[Window, str] | None:
         """Take a keyframe.
 
         Args:
             stamp_ns: of the keyframe.
-            sightings: of all cameras.
+            camera_tracks: of all cameras.
             is_stationary: whether the rig stands.
             states: of the window that uses overlaps, or None as long as it does not know the scale.
 
@@ -66,7 +66,7 @@ class OverlapTrust:
         """
         if self._initialiser is None:
             return None
-        window = self._initialiser.add(stamp_ns, alone(sightings), is_stationary)
+        window = self._initialiser.add(stamp_ns, alone(camera_tracks), is_stationary)
         if window is None:
             return None
         if states is None:

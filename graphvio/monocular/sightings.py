@@ -1,4 +1,4 @@
-"""What single cameras saw at the states of a window, and the landmarks that these sightings are joined to.
+"""What single cameras saw at the states of a window, and the landmarks that these tracks are joined to.
 
 A track is used as a chain of landmarks, each seen from a limited number of keyframes. When the oldest keyframe leaves
 the window, the landmarks that it sees have all their views there, and are eliminated with it: each view counts once.
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Structure
 
@@ -22,7 +22,7 @@ _MIX = 2654435761  # of Knuth's multiplicative hash: lengths do not depend on th
 
 
 class Views(NamedTuple):
-    """Sightings of one state, joined to landmarks: M of all cameras.
+    """Tracks seen at one state, joined to landmarks: M of all cameras.
 
     Attributes:
         camera: (M,) index of the camera that sees them.
@@ -86,33 +86,33 @@ class LandmarkNames:
         self._tracks = (_NONE, _NONE, _NONE)  # camera, identity and landmark of the newest tracks
         self._next = 0
 
-    def join(self, sightings: Mapping[int, Sighting]) -> Views:
-        """Join the sightings of an instant to landmarks; points that have none begin one."""
-        ordered = sorted(sightings.items())
+    def join(self, camera_tracks: Mapping[int, CameraTracks]) -> Views:
+        """Join the tracks of an instant to landmarks; points that have none begin one."""
+        ordered = sorted(camera_tracks.items())
         if not ordered:
             return _NO_VIEWS
-        of_tracks = [self._points_of(j, sighting) for j, sighting in ordered]
-        ids = np.concatenate([sighting.ids for _, sighting in ordered])
-        cameras = np.concatenate([np.full(len(sighting.ids), j, dtype=np.int64) for j, sighting in ordered])
+        of_tracks = [self._points_of(j, tracks) for j, tracks in ordered]
+        ids = np.concatenate([tracks.ids for _, tracks in ordered])
+        cameras = np.concatenate([np.full(len(tracks.ids), j, dtype=np.int64) for j, tracks in ordered])
         landmarks = self._name(np.concatenate(of_tracks), ids, cameras, np.array([j for j, _ in ordered]))
         self._tracks = cameras, ids, landmarks
         parts, ranks, begin = [], [], 0
-        for j, sighting in ordered:
-            n = len(sighting.ids)
+        for j, tracks in ordered:
+            n = len(tracks.ids)
             named, own, rank = landmarks[begin : begin + n], np.full(n, j, dtype=np.int64), np.zeros(n, dtype=np.int64)
-            rank[sighting.adopted.rows] = 2
+            rank[tracks.handed_over.rows] = 2
             begin += n
-            parts.append(Views(own, own, sighting.ids, named, sighting.rays, rank > 0))
+            parts.append(Views(own, own, tracks.ids, named, tracks.rays, rank > 0))
             ranks.append(rank)
-            for seen in sighting.elsewhere:
+            for seen in tracks.matches:
                 rows, other = seen.rows, np.full(len(seen.rows), seen.camera, dtype=np.int64)
-                parts.append(Views(other, own[rows], sighting.ids[rows], named[rows], seen.rays, rank[rows] > 0))
+                parts.append(Views(other, own[rows], tracks.ids[rows], named[rows], seen.rays, rank[rows] > 0))
                 ranks.append(rank[rows] + 1)
         views = Views(*(np.concatenate(each) for each in zip(*parts, strict=True)))
         return views.once(np.concatenate(ranks))
 
     def note_keyframe(self) -> None:
-        """Take note that the newest sightings are those of a keyframe."""
+        """Take note that the newest tracks are those of a keyframe."""
         self._left = self._left - 1
 
     def end(self, landmarks: Int) -> None:
@@ -125,10 +125,10 @@ class LandmarkNames:
         cameras, ids = self._tracks[0][ended], self._tracks[1][ended]
         return {int(j): np.unique(ids[cameras == j]) for j in np.unique(cameras)}
 
-    def _points_of(self, camera: int, sighting: Sighting) -> Int:
+    def _points_of(self, camera: int, tracks: CameraTracks) -> Int:
         """Return numbers (N,) of the points that a camera's tracks follow: of the camera and track that began each."""
-        points = sighting.ids * self._n_cameras + camera
-        rows, cameras, ids = sighting.adopted
+        points = tracks.ids * self._n_cameras + camera
+        rows, cameras, ids = tracks.handed_over
         points[rows] = ids * self._n_cameras + cameras
         return points
 

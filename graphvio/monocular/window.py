@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views
 from graphvio.monocular.states import Prior, States
 
@@ -58,7 +58,7 @@ class Window:
             velocities=np.concatenate([states.velocities[:n], velocity[None]]),
         )
 
-    def add_views(self, sightings: Mapping[int, Sighting], is_stationary: bool) -> None:
+    def add_views(self, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool) -> None:
         """Add what the cameras see from the newest state: camera -> tracks."""
-        self.views.append(self.names.join(sightings))
+        self.views.append(self.names.join(camera_tracks))
         self.stationary.append(is_stationary)

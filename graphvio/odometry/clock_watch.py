@@ -15,7 +15,7 @@ from graphvio.backend.imu_match import VisualStep, match_rates, turn_disagreemen
 from graphvio.backend.inertial import MeanReadings
 from graphvio.frontend.turn import turn_between
 from graphvio.geometry import se3
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
 from graphvio.odometry.imu_clock import MAX_SHIFT_S, ImuClock
 from graphvio.odometry.synchroniser import Synchroniser
@@ -56,23 +56,23 @@ class ClockWatch:
         self._clock = clock
         self._synchroniser = synchroniser
         self._steps: deque[VisualStep] = deque(maxlen=_COMPARED)
-        self._seen: deque[tuple[int, Mapping[int, Sighting]]] = deque()  # at instants that a step may begin with
+        self._seen: deque[tuple[int, Mapping[int, CameraTracks]]] = deque()  # at instants that a step may begin with
         self._next_ns = 0  # of the next comparison at all shifts
         self._found_s: float | None = None  # by the last one
 
-    def update(self, stamp_ns: int, sightings: Mapping[int, Sighting], has_pose: bool) -> bool:
+    def update(self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], has_pose: bool) -> bool:
         """Update the comparison of the gyro's turns with those of the cameras, by a frameset.
 
         Args:
             stamp_ns: Its stamp.
-            sightings: What the cameras see.
+            camera_tracks: What the cameras see.
             has_pose: Whether a correction would end an epoch.
 
         Returns:
             Whether the clock has been corrected: nothing that the IMU has shown until now holds.
         """
         judged = _COMPARED if has_pose else _JUDGED_WITHOUT_POSE
-        if not self._add_step(stamp_ns, sightings) or len(self._steps) < judged:
+        if not self._add_step(stamp_ns, camera_tracks) or len(self._steps) < judged:
             return False
         readings = self._synchroniser.mean_readings()
         disagreement = turn_disagreement(list(self._steps)[-judged:], readings)
@@ -121,15 +121,15 @@ class ClockWatch:
         self._found_s, self.is_doubted = None, False
         return True
 
-    def _add_step(self, stamp_ns: int, sightings: Mapping[int, Sighting]) -> bool:
+    def _add_step(self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks]) -> bool:
         """Add the turn over the newest step, if it is due, and return whether there is one."""
         if self._seen and stamp_ns - self._seen[-1][0] < _INTERVAL_NS:
             return False
-        self._seen.append((stamp_ns, sightings))
+        self._seen.append((stamp_ns, camera_tracks))
         while len(self._seen) > 1 and stamp_ns - self._seen[1][0] >= _STEP_NS:
             self._seen.popleft()
         for begin_ns, then in list(self._seen)[:-1]:
-            then_R_now = turn_between(self._rig, then, sightings) if stamp_ns - begin_ns < _MAX_STEP_NS else None
+            then_R_now = turn_between(self._rig, then, camera_tracks) if stamp_ns - begin_ns < _MAX_STEP_NS else None
             if then_R_now is not None:
                 self._steps.append(VisualStep(begin_ns, stamp_ns, se3(then_R_now, np.zeros(3))))
                 return True

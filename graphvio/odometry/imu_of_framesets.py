@@ -89,7 +89,7 @@ class ImuOfFramesets:
         """
         if self._clock_watch is not None:
             assert isinstance(self._estimator, MonocularEstimator)
-            is_corrected = self._clock_watch.update(stamp_ns, visual.sightings, self._estimator.has_pose)
+            is_corrected = self._clock_watch.update(stamp_ns, visual.camera_tracks, self._estimator.has_pose)
             if is_corrected:
                 self._estimator.restart_imu(stamp_ns)
             self._estimator.doubt_imu(stamp_ns, self._clock_watch.is_doubted)
