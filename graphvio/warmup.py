@@ -27,7 +27,7 @@ from graphvio.config import Config
 from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import with_unknown_scales
-from graphvio.frontend.extrinsic_monitor import learn_from_nothing
+from graphvio.frontend.extrinsic_monitor import warm_up_extrinsic_monitor
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import inverse_depths_around
@@ -41,10 +41,10 @@ from graphvio.kernel_cache import any_compiled_before, cache_root
 from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_elsewhere
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
-from graphvio.monocular.warm_up import adjust_no_keyframes
+from graphvio.monocular.warm_up import warm_up_keyframe_window
 from graphvio.png import undo_filters
 from graphvio.rig import Imu, Rig
-from graphvio.self_calibration.online import adjust_nothing
+from graphvio.self_calibration.online import warm_up_adjustment
 from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
@@ -71,10 +71,10 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
     _warm_up_imu(rig.imu or Imu())
     _warm_up_motion(rig, config)
     if not rig.pairs:
-        adjust_no_keyframes(rig)
+        warm_up_keyframe_window(rig)
     if config.estimates_calibration and (wait_for_calibration or not is_compiling_elsewhere()):
         await_compilers()
-        adjust_nothing(rig)
+        warm_up_adjustment(rig)
 
 
 def compile_for_another() -> None:
@@ -83,7 +83,7 @@ def compile_for_another() -> None:
     _warm_up_motion(rig, config)
     os.write(sys.stdout.fileno(), _MOTION_IS_COMPILED)
     if config.estimates_calibration:
-        adjust_nothing(rig)
+        warm_up_adjustment(rig)
 
 
 def _are_compiled(config: Config) -> bool:
@@ -181,7 +181,7 @@ def _warm_up_motion(rig: Rig, config: Config) -> None:
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
     arrays = RigArrays.of(rig)
     motion = joint_motion_known_depths(arrays, observations, np.eye(4), config.motion, rng)
-    learn_from_nothing(motion)
+    warm_up_extrinsic_monitor(motion)
     by_depth_errors(arrays, observations, motion.inlier, np.eye(4))
     if rig.pairs and rig.singles:
         camera_motions(motion.cur_T_ref, arrays)

@@ -101,7 +101,7 @@ class ExtrinsicMonitor:
         return ExtrinsicError(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
 
-def learn_from_nothing(motion: Refined) -> None:
+def warm_up_extrinsic_monitor(motion: Refined) -> None:
     """Compile the kernels of `ExtrinsicMonitor` by a motion without information, for the warm-up."""
     monitor = ExtrinsicMonitor()
     for _ in range(_T.min_motions):

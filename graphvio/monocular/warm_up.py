@@ -19,7 +19,7 @@ from graphvio.self_calibration.preintegration import preintegrate
 from graphvio.self_calibration.prior import file_prior
 
 
-def adjust_no_keyframes(rig: Rig) -> None:
+def warm_up_keyframe_window(rig: Rig) -> None:
     """Call the kernels of the window, and of its calibration, without landmarks: they are then compiled or loaded."""
     second = 1_000_000_000
     stamps = np.arange(-second // 10, second, 5_000_000)

@@ -360,7 +360,7 @@ class SelfCalibration:
         return evidence, likelihood, *evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
 
 
-def adjust_nothing(rig: Rig) -> None:
+def warm_up_adjustment(rig: Rig) -> None:
     """Adjust two keyframes that see one point, to compile or load the kernels."""
     stamps_ns, point = (0, 100_000_000), np.full((1, 2), 100.0)
     seen = View(np.zeros(1, dtype=np.int64), point, point, np.ones(1, dtype=bool), np.ones(1))
