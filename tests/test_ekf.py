@@ -12,7 +12,15 @@ from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
 from graphvio.backend.ekf.filter import ExtendedKalmanFilter
-from graphvio.backend.ekf.measurements import GRAVITY, Measurement, VisualRates, accelerometer, gyro, stacked, vision
+from graphvio.backend.ekf.measurements import (
+    STANDSTILL_FORCE_NAV,
+    Measurement,
+    VisualRates,
+    accelerometer,
+    gyro,
+    stacked,
+    vision,
+)
 from graphvio.backend.ekf.process import NOISES, jacobians, noise_sigmas, propagated
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
 from graphvio.geometry import se3_exp, se3_inverse, so3_exp, so3_log
@@ -120,7 +128,7 @@ def test_a_steady_rig_agrees_with_what_it_measures() -> None:
     motion = RelativeMotion(0, round(DT * 1e9), moved, np.eye(6), np.zeros((6, 6)), 100)
     np.testing.assert_allclose(vision(after, VisualRates.of(motion)).innovation, 0.0, atol=1e-10)
     is_stationary = replace(after, rate_body=np.zeros(3))
-    force = is_stationary.nav_R_body.T @ GRAVITY
+    force = is_stationary.nav_R_body.T @ STANDSTILL_FORCE_NAV
     np.testing.assert_allclose(accelerometer(is_stationary, force, 1.0).innovation, 0.0, atol=1e-12)
     np.testing.assert_allclose(gyro(is_stationary, is_stationary.gyro_bias, 0.1).innovation, 0.0, atol=1e-12)
 
@@ -179,7 +187,7 @@ def test_what_resets_forget_adds_up_to_what_is_not_known_of_the_position() -> No
         for running in (plain, reset):
             running.predict(DT, sigmas)
             state = running.state
-            level = accelerometer(state, state.nav_R_body.T @ GRAVITY, 1.0)
+            level = accelerometer(state, state.nav_R_body.T @ STANDSTILL_FORCE_NAV, 1.0)
             running.update(stacked([vision(state, no_rates), level]))
     total = reset.covariance[POSITION, POSITION] + forgotten
     np.testing.assert_allclose(total, plain.covariance[POSITION, POSITION], rtol=0.02, atol=1e-6)

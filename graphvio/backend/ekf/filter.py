@@ -35,12 +35,12 @@ class ExtendedKalmanFilter:
 
     def gate(self, measurement: Measurement, probability: float) -> GateResult:
         """Test the innovation of a measurement."""
-        return gate_innovation(measurement.innovation, self._spread(measurement), probability)
+        return gate_innovation(measurement.innovation, self._innovation_covariance(measurement), probability)
 
     def update(self, measurement: Measurement) -> None:
         """Update by a measurement, in Joseph's form."""
         by_error = measurement.by_error
-        gain = np.linalg.solve(self._spread(measurement), by_error @ self.covariance).T
+        gain = np.linalg.solve(self._innovation_covariance(measurement), by_error @ self.covariance).T
         kept = np.eye(ERRORS) - gain @ by_error
         covariance = kept @ self.covariance @ kept.T + gain @ measurement.covariance @ gain.T
         self.covariance = 0.5 * (covariance + covariance.T)
@@ -62,6 +62,6 @@ class ExtendedKalmanFilter:
         self.covariance[POSITION, POSITION] = through_others + sigma_m**2 * np.eye(3)
         return forgotten
 
-    def _spread(self, measurement: Measurement) -> Float:
+    def _innovation_covariance(self, measurement: Measurement) -> Float:
         """Return the covariance (M, M) of the innovation."""
         return measurement.by_error @ self.covariance @ measurement.by_error.T + measurement.covariance

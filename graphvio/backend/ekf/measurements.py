@@ -13,8 +13,8 @@ from graphvio.geometry import skew, so3_log, so3_right_jacobian_inverse
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.measurements.sensors import GRAVITY_M_S2
 
-GRAVITY = np.array([0.0, 0.0, GRAVITY_M_S2])
-"""Specific force at a standstill, in nav."""
+STANDSTILL_FORCE_NAV = np.array([0.0, 0.0, GRAVITY_M_S2])
+"""Specific force (3,) m/s^2 at a standstill, in nav: upwards, the opposite of ``gravity_nav``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ def gyro(state: FilterState, rate: Float, sigma_rad_s: float) -> Measurement:
 
 def accelerometer(state: FilterState, force: Float, sigma_m_s2: float) -> Measurement:
     """Measure ``a^imu = R(q) g + n``, where the rig's own acceleration is part of the noise."""
-    expected = state.nav_R_body.T @ GRAVITY
+    expected = state.nav_R_body.T @ STANDSTILL_FORCE_NAV
     by_error = np.zeros((3, ERRORS))
     by_error[:, ATTITUDE] = skew(expected)
     return Measurement("accelerometer", force - expected, by_error, sigma_m_s2**2 * np.eye(3))
