@@ -13,7 +13,13 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 from graphvio.arrays import Float
 from graphvio.frontend.blocks import POINTS, SIZE, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import camera_motions
-from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
+from graphvio.frontend.linearisation import (
+    LinearisationPoints,
+    allocate_points,
+    information_through_points,
+    linearise,
+    relinearise_points,
+)
 from graphvio.frontend.observations import Observations, RigArrays
 
 RIG = two_pair_rig()
@@ -28,23 +34,23 @@ PAIRS_AND_RIGHTS = pytest.mark.parametrize(
 
 @dataclass
 class Places:
-    """An expansion point by point: points (N, 3), offsets (N, 4) and whiteners (N, 4, 4)."""
+    """Linearisation points one by one: points (N, 3), offsets (N, 4) and whiteners (N, 4, 4)."""
 
     points: Float
     offsets: Float
     whiteners: Float
 
     @staticmethod
-    def of(seen: Observations, at: Expansion) -> Places:
+    def of(seen: Observations, points_at: LinearisationPoints) -> Places:
         blocks, whiteners = in_blocks(seen), np.zeros((len(seen.pair), 4, 4))
 
         def columns(rows: Float) -> Float:
             return np.column_stack([point_by_point(blocks, row) for row in np.hsplit(rows, rows.shape[1] // POINTS)])
 
-        whiteners[:, *np.tril_indices(4)] = columns(at.whiteners)
-        return Places(columns(at.points), columns(at.offsets), whiteners)
+        whiteners[:, *np.tril_indices(4)] = columns(points_at.whiteners)
+        return Places(columns(points_at.points), columns(points_at.offsets), whiteners)
 
-    def expansion(self, seen: Observations) -> Expansion:
+    def linearisation_points(self, seen: Observations) -> LinearisationPoints:
         """The same as the kernels take it."""
         blocks = in_blocks(seen)
 
@@ -52,7 +58,9 @@ class Places:
             return np.hstack([lane_by_lane(blocks, np.ascontiguousarray(column)) for column in columns.T])
 
         shifts = self.points - seen.points
-        return Expansion(*map(rows, (shifts, self.points, self.offsets, self.whiteners[:, *np.tril_indices(4)])))
+        return LinearisationPoints(
+            *map(rows, (shifts, self.points, self.offsets, self.whiteners[:, *np.tril_indices(4)]))
+        )
 
 
 def scene(pairs: tuple[int, ...], share: float) -> tuple[Observations, Float]:
@@ -102,23 +110,23 @@ def by_point(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Floa
 
 
 def linearised(
-    seen: Observations, cur_T_ref: Float, at: Expansion, active: Float | None = None
+    seen: Observations, cur_T_ref: Float, points_at: LinearisationPoints, active: Float | None = None
 ) -> tuple[float, Float, Float, Float]:
     """What `linearise` says: cost, normal matrix (6, 6), gradient (6,) and squared errors (N,)."""
     blocks = in_blocks(seen)
     hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty((len(blocks.pair), POINTS))
     counted = lane_by_lane(blocks, np.ones(len(seen.pair)) if active is None else active)
     motions = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    cost = linearise(motions, ARRAYS, blocks, at, counted, SCALE, hessian, gradient, errors2)
+    cost = linearise(motions, ARRAYS, blocks, points_at, counted, SCALE, hessian, gradient, errors2)
     return cost, hessian, gradient, point_by_point(blocks, errors2)
 
 
-def expanded(seen: Observations, cur_T_ref: Float) -> Expansion:
+def relinearised(seen: Observations, cur_T_ref: Float) -> LinearisationPoints:
     blocks = in_blocks(seen)
-    at = unexpanded(blocks)
+    points_at = allocate_points(blocks)
     for _ in range(2):  # the second goes on where the first ended
-        expand(camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, blocks, SIGMAS, at)
-    return at
+        relinearise_points(camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, blocks, SIGMAS, points_at)
+    return points_at
 
 
 @given(counts=st.lists(st.integers(0, 70), min_size=1, max_size=4))
@@ -146,11 +154,11 @@ def test_in_blocks_holds_every_point_once(counts: list[int]) -> None:
 def test_linearise_gradient_is_the_numerical_derivative_of_the_cost(pairs: tuple[int, ...], share: float) -> None:
     """``sum w J^T r``, r being measured minus predicted, is ``-scale^2 / 2`` times the derivative of the cost."""
     seen, cur_T_ref = scene(pairs, share)
-    at = expanded(seen, cur_T_ref)
-    gradient = linearised(seen, cur_T_ref, at)[2]
+    points_at = relinearised(seen, cur_T_ref)
+    gradient = linearised(seen, cur_T_ref, points_at)[2]
     numerical = np.empty(6)
     for axis, step in enumerate(1e-6 * np.eye(6)):
-        more, less = (linearised(seen, moved(sign * step, cur_T_ref), at)[0] for sign in (1.0, -1.0))
+        more, less = (linearised(seen, moved(sign * step, cur_T_ref), points_at)[0] for sign in (1.0, -1.0))
         numerical[axis] = (more - less) / 2e-6
     np.testing.assert_allclose(gradient, -0.5 * SCALE**2 * numerical, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
 
@@ -158,17 +166,17 @@ def test_linearise_gradient_is_the_numerical_derivative_of_the_cost(pairs: tuple
 @PAIRS_AND_RIGHTS
 def test_linearise_normal_equations_match_numerical_derivatives(pairs: tuple[int, ...], share: float) -> None:
     seen, cur_T_ref = scene(pairs, share)
-    expansion = expanded(seen, cur_T_ref)
-    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, expansion)
-    at = Places.of(seen, expansion)
+    linearisation_points = relinearised(seen, cur_T_ref)
+    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, linearisation_points)
+    points_at = Places.of(seen, linearisation_points)
     expected_hessian, expected_gradient = np.zeros((6, 6)), np.zeros(6)
     expected_cost = 0.0
     for i in range(len(seen.pair)):
-        plain = errors_px(seen, i, at.points[i], cur_T_ref)
+        plain = errors_px(seen, i, points_at.points[i], cur_T_ref)
         n = len(plain)
-        whitener = at.whiteners[i, :n, :n]
-        errors = whitener @ (plain - at.offsets[i, :n])
-        derivative = whitener @ by_motion(seen, i, at.points[i], cur_T_ref)
+        whitener = points_at.whiteners[i, :n, :n]
+        errors = whitener @ (plain - points_at.offsets[i, :n])
+        derivative = whitener @ by_motion(seen, i, points_at.points[i], cur_T_ref)
         assert errors2[i] == pytest.approx(errors @ errors, rel=1e-9)
         weight = 1.0 / (1.0 + errors @ errors / SCALE**2)
         expected_cost += float(np.log1p(errors @ errors / SCALE**2))
@@ -181,21 +189,23 @@ def test_linearise_normal_equations_match_numerical_derivatives(pairs: tuple[int
 
 
 @PAIRS_AND_RIGHTS
-def test_expand_whitens_at_the_point_of_both_instants(pairs: tuple[int, ...], share: float) -> None:
+def test_relinearise_points_whitens_at_the_point_of_both_instants(pairs: tuple[int, ...], share: float) -> None:
     """The covariance ``sigma^2 (1 + J C J^T)``, and the correction ``C J^T S^-1 r`` that leads to the same place."""
     seen, cur_T_ref = scene(pairs, share)
-    at = Places.of(seen, expanded(seen, cur_T_ref))
+    points_at = Places.of(seen, relinearised(seen, cur_T_ref))
     followed = 0
     for i in range(len(seen.pair)):
-        derivative = by_point(seen, i, at.points[i], cur_T_ref)
+        derivative = by_point(seen, i, points_at.points[i], cur_T_ref)
         n = len(derivative)
         sigma = SIGMAS[seen.pair[i]]
         covariance = sigma**2 * (np.eye(n) + derivative @ seen.covariances[i] @ derivative.T)
         whitener = np.linalg.inv(np.linalg.cholesky(covariance))
-        np.testing.assert_allclose(at.whiteners[i, :n, :n], whitener, rtol=1e-5, atol=1e-6 * np.abs(whitener).max())
-        shift = at.points[i] - seen.points[i]
-        np.testing.assert_allclose(at.offsets[i, :n], -derivative @ shift, rtol=1e-5, atol=1e-6)
-        errors = errors_px(seen, i, at.points[i], cur_T_ref) + derivative @ shift
+        np.testing.assert_allclose(
+            points_at.whiteners[i, :n, :n], whitener, rtol=1e-5, atol=1e-6 * np.abs(whitener).max()
+        )
+        shift = points_at.points[i] - seen.points[i]
+        np.testing.assert_allclose(points_at.offsets[i, :n], -derivative @ shift, rtol=1e-5, atol=1e-6)
+        errors = errors_px(seen, i, points_at.points[i], cur_T_ref) + derivative @ shift
         e2 = float(errors @ np.linalg.solve(covariance, errors))
         if e2 < 16.0:  # farther errors move a point only in part
             best = sigma**2 * seen.covariances[i] @ derivative.T @ np.linalg.solve(covariance, errors)
@@ -208,15 +218,17 @@ def test_expand_whitens_at_the_point_of_both_instants(pairs: tuple[int, ...], sh
 @PAIRS_AND_RIGHTS
 def test_information_through_points_matches_its_formula(pairs: tuple[int, ...], share: float) -> None:
     seen, cur_T_ref = scene(pairs, share)
-    expansion = expanded(seen, cur_T_ref)
-    at, blocks = Places.of(seen, expansion), in_blocks(seen)
+    linearisation_points = relinearised(seen, cur_T_ref)
+    points_at, blocks = Places.of(seen, linearisation_points), in_blocks(seen)
     factors = np.random.default_rng(3).uniform(-0.2, 1.0, len(seen.pair)).clip(0.0)
     motions = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    found = information_through_points(motions, ARRAYS, blocks, expansion, SIGMAS, lane_by_lane(blocks, factors))
+    found = information_through_points(
+        motions, ARRAYS, blocks, linearisation_points, SIGMAS, lane_by_lane(blocks, factors)
+    )
     expected = np.zeros((6, 6))
     for i, factor in enumerate(factors):
-        derivative = by_motion(seen, i, at.points[i], cur_T_ref)
-        through = by_point(seen, i, at.points[i], cur_T_ref)
+        derivative = by_motion(seen, i, points_at.points[i], cur_T_ref)
+        through = by_point(seen, i, points_at.points[i], cur_T_ref)
         sigma = SIGMAS[seen.pair[i]]
         inverse = np.linalg.inv(sigma**2 * (np.eye(len(through)) + through @ seen.covariances[i] @ through.T))
         expected += factor * derivative.T @ (inverse - sigma**2 * inverse @ inverse) @ derivative
@@ -226,17 +238,19 @@ def test_information_through_points_matches_its_formula(pairs: tuple[int, ...], 
 
 def test_linearise_leaves_out_points_behind_a_camera_and_inactive_ones() -> None:
     seen, cur_T_ref = scene((0, 1), 0.6)
-    at = Places.of(seen, expanded(seen, cur_T_ref))
+    points_at = Places.of(seen, relinearised(seen, cur_T_ref))
     behind, n = 7, len(seen.pair)
     motions = camera_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    at.points[behind, 2] = -2.0 / motions[0, 0, 2, 3]  # the motion takes its depth from 1 to about -1 of itself
+    points_at.points[behind, 2] = -2.0 / motions[0, 0, 2, 3]  # the motion takes its depth from 1 to about -1 of itself
     active = np.arange(n) != 3
-    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, at.expansion(seen), active.astype(float))
+    cost, hessian, gradient, errors2 = linearised(
+        seen, cur_T_ref, points_at.linearisation_points(seen), active.astype(float)
+    )
     assert np.flatnonzero(np.isinf(errors2)).tolist() == [behind]
     counted = active & (np.arange(n) != behind)
     few = seen.of_rows(counted)
-    places = Places(at.points[counted], at.offsets[counted], at.whiteners[counted])
-    part = linearised(few, cur_T_ref, places.expansion(few))
+    places = Places(points_at.points[counted], points_at.offsets[counted], points_at.whiteners[counted])
+    part = linearised(few, cur_T_ref, places.linearisation_points(few))
     assert cost == pytest.approx(part[0] + np.log1p(1e6))
     np.testing.assert_allclose(hessian, part[1], rtol=1e-11)
     np.testing.assert_allclose(gradient, part[2], rtol=1e-9, atol=1e-9)
@@ -251,11 +265,11 @@ def test_linearise_with_points_next_to_the_camera_plane_stays_finite() -> None:
     for k, i in enumerate(near):  # depths over the reference depth of both signs, from nothing to a hundredth
         points[i, 2] = (1e-3 * (k - 5) - depth[:3] @ [*points[i, :2], 1.0]) / depth[3]
     seen = seen._replace(points=points, covariances=1e12 * seen.covariances)  # depths of which nothing is known
-    at = expanded(seen, cur_T_ref)
-    assert all(np.isfinite(rows).all() for rows in at)
+    points_at = relinearised(seen, cur_T_ref)
+    assert all(np.isfinite(rows).all() for rows in points_at)
     active = np.ones(n)
     active[near] = 0.0
-    cost, hessian, gradient, _ = linearised(seen, cur_T_ref, at, active)
+    cost, hessian, gradient, _ = linearised(seen, cur_T_ref, points_at, active)
     assert np.isfinite(cost)
     assert np.isfinite(hessian).all()
     assert np.isfinite(gradient).all()

@@ -18,7 +18,7 @@ from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.blocks import POINTS, in_blocks, lane_by_lane
 from graphvio.frontend.cost import camera_motions
-from graphvio.frontend.linearisation import expand, linearise, unexpanded
+from graphvio.frontend.linearisation import allocate_points, linearise, relinearise_points
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
@@ -91,9 +91,9 @@ def _normal_equations(
 ) -> tuple[Float, Float]:
     """Return the information (6, 6) and gradient (6,) of the inliers of N points at a motion."""
     blocks, motions = in_blocks(observations), camera_motions(cur_T_ref, rig)
-    at = unexpanded(blocks)
-    expand(motions, rig, blocks, np.full(len(rig.focal_px), sigma_px), at)
+    points_at = allocate_points(blocks)
+    relinearise_points(motions, rig, blocks, np.full(len(rig.focal_px), sigma_px), points_at)
     hessian, gradient = np.empty((6, 6)), np.empty(6)
     active = lane_by_lane(blocks, inlier.astype(np.float64))
-    linearise(motions, rig, blocks, at, active, scale, hessian, gradient, np.empty((len(blocks.pair), POINTS)))
+    linearise(motions, rig, blocks, points_at, active, scale, hessian, gradient, np.empty((len(blocks.pair), POINTS)))
     return hessian, gradient

@@ -30,15 +30,15 @@ from graphvio.frontend.point_errors import (
 )
 from graphvio.kernels import put, vector_kernel
 
-_EXPANSIONS = 2
+_RELINEARISATIONS = 2
 _MAX_FOLLOWED_ERROR2 = (
     16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage
 )
 _COLUMN = 4 * POINTS  # of whitened derivatives: the four rows of each of a block's points
 
 
-class Expansion(NamedTuple):
-    """Places at which the errors of points are linearised, in blocks as `graphvio.frontend.blocks.Blocks`.
+class LinearisationPoints(NamedTuple):
+    """Points at which their errors are linearised, in blocks as `graphvio.frontend.blocks.Blocks`.
 
     Attributes:
         shifts: (B, 3 POINTS) corrections of the points, by the errors at both instants.
@@ -54,42 +54,44 @@ class Expansion(NamedTuple):
 
 
 @vector_kernel
-def unexpanded(blocks: Blocks) -> Expansion:
-    """Allocate an expansion, with no correction of the points."""
+def allocate_points(blocks: Blocks) -> LinearisationPoints:
+    """Allocate linearisation points, with no correction yet."""
     n = len(blocks.pair)
-    return Expansion(
+    return LinearisationPoints(
         np.zeros((n, 3 * POINTS)), np.empty((n, 3 * POINTS)), np.empty((n, 4 * POINTS)), np.empty((n, 10 * POINTS))
     )
 
 
 @vector_kernel
-def expand(motions: Float, rig: RigArrays, blocks: Blocks, sigmas_px: Float, at: Expansion) -> None:
+def relinearise_points(
+    motions: Float, rig: RigArrays, blocks: Blocks, sigmas_px: Float, points_at: LinearisationPoints
+) -> None:
     """Re-estimate each point from both instants (errors in variables), and compute its whitener ``S^-1/2``.
 
-    The search for the points' places continues from those of the last expansion.
+    The search for the points' places continues from those of the last call.
 
     Args:
         motions: (P, 2, 4, 4), see `graphvio.frontend.cost.camera_motions`.
         rig: of P pairs.
         blocks: of N points.
         sigmas_px: (P,) pixel noise of each pair.
-        at: output.
+        points_at: output.
     """
     for b in range(len(blocks.pair)):
         j = blocks.pair[b]
-        for _ in range(_EXPANSIONS):
-            _expand_block(
+        for _ in range(_RELINEARISATIONS):
+            _relinearise_block(
                 motions[j, 0], motions[j, 1], rig.focal_px[j, 0], rig.focal_px[j, 1], sigmas_px[j], blocks.values[b],
-                at.shifts[b], at.points[b], at.offsets[b], at.whiteners[b],
+                points_at.shifts[b], points_at.points[b], points_at.offsets[b], points_at.whiteners[b],
             )  # fmt: skip
 
 
 @vector_kernel
-def _expand_block(
+def _relinearise_block(
     to_left: Float, to_right: Float, focal_left: float, focal_right: float, sigma: float, block: Float,
     shifts: Float, points: Float, offsets: Float, whiteners: Float,
 ) -> None:  # fmt: skip
-    """Expand one block, see `expand`."""
+    """Relinearise one block, see `relinearise_points`."""
     left, right = elements(to_left), elements(to_right)
     for i in range(POINTS):
         shift = shifts[X + i], shifts[Y + i], shifts[W + i]
@@ -127,7 +129,7 @@ def _expand_block(
 
 @vector_kernel
 def linearise(
-    motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, active: Float, scale: float,
+    motions: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, active: Float, scale: float,
     hessian: Float, gradient: Float, errors2: Float,
 ) -> float:  # fmt: skip
     """Fill the normal equations for a perturbation ``exp(d) cur_T_ref`` and return the robust cost.
@@ -136,7 +138,7 @@ def linearise(
         motions: (P, 2, 4, 4) at which to linearise.
         rig: of P pairs.
         blocks: of N points.
-        at: expansion of the points.
+        points_at: of the points, see `relinearise_points`.
         active: (B, POINTS) 1 for points that count; the others, which are 0, only get their errors.
         scale: of the Cauchy cost, in whitened units.
         hessian: (6, 6) output.
@@ -146,7 +148,7 @@ def linearise(
     columns, weights, normal = np.empty(7 * _COLUMN), np.empty(POINTS), np.zeros((7, 7))
     cost, inverse_scale2 = 0.0, 1.0 / (scale * scale)
     for b in range(len(blocks.pair)):
-        _whiten_block(motions, rig, blocks, at, b, columns, errors2[b])
+        _whiten_block(motions, rig, blocks, points_at, b, columns, errors2[b])
         product = 1.0  # see `graphvio.frontend.cost`
         for i in range(POINTS):
             e2 = min(errors2[b, i] * inverse_scale2, MAX_ERROR2)
@@ -161,7 +163,7 @@ def linearise(
 
 @vector_kernel
 def information_through_points(
-    motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float, factors: Float
+    motions: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, sigmas_px: Float, factors: Float
 ) -> Float:
     """Sum ``f (J^T S^-1 J - sigma^2 J^T S^-2 J)`` (6, 6) over the points, each with a factor f (B, POINTS).
 
@@ -169,10 +171,10 @@ def information_through_points(
     """
     columns, weights, normal = np.empty(7 * _COLUMN), np.empty(POINTS), np.zeros((7, 7))
     for b in range(len(blocks.pair)):
-        _whiten_block(motions, rig, blocks, at, b, columns, weights)
+        _whiten_block(motions, rig, blocks, points_at, b, columns, weights)
         put(weights, factors[b])
         _add_squares(columns, weights, normal)
-        _whiten_again(at.whiteners[b], columns)
+        _whiten_again(points_at.whiteners[b], columns)
         weights *= -(sigmas_px[blocks.pair[b]] ** 2)
         _add_squares(columns, weights, normal)
     return _symmetric(normal)
@@ -180,11 +182,12 @@ def information_through_points(
 
 @vector_kernel
 def _whiten_block(
-    motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, b: int, columns: Float, errors2: Float
-) -> None:
+    motions: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, b: int, columns: Float,
+    errors2: Float,
+) -> None:  # fmt: skip
     """Fill a block's whitened derivatives (6, 4, POINTS), after them its errors (4, POINTS), and their squares."""
     j, block, points, offsets, whiteners = (
-        blocks.pair[b], blocks.values[b], at.points[b], at.offsets[b], at.whiteners[b],
+        blocks.pair[b], blocks.values[b], points_at.points[b], points_at.offsets[b], points_at.whiteners[b],
     )  # fmt: skip
     to_left, to_right = elements(motions[j, 0]), elements(motions[j, 1])
     left_T_body, right_T_body = elements(rig.cam_T_body[j, 0]), elements(rig.cam_T_body[j, 1])

@@ -18,7 +18,13 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import camera_motions
-from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
+from graphvio.frontend.linearisation import (
+    LinearisationPoints,
+    allocate_points,
+    information_through_points,
+    linearise,
+    relinearise_points,
+)
 from graphvio.frontend.noise import influence, influence_slope, inlier_cutoff, noise_by_pair, noise_variance
 from graphvio.frontend.observations import Observations, RigArrays, image_by_image, is_depth_known
 from graphvio.geometry import se3_compose, se3_exp
@@ -115,9 +121,9 @@ def _refined(
     """
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right, blocks = observations.has_right, in_blocks(observations)
-    at, pose, hessian = unexpanded(blocks), cur_T_ref, np.empty((6, 6))
+    points_at, pose, hessian = allocate_points(blocks), cur_T_ref, np.empty((6, 6))
     sigmas_px = np.full(len(rig.focal_px), sigma)
-    errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
+    errors2 = _squared_errors(pose, rig, blocks, points_at, sigmas_px)
     is_known = len(known) == len(has_right)
     inlier = known if is_known else np.ones(len(has_right), dtype=np.bool_)
     scale = widest
@@ -143,12 +149,12 @@ def _refined(
             if is_last:
                 inlier &= _is_of_an_explained_pair(observations.pair, inlier, len(sigmas_px))
         pose, hessian, errors2 = _levenberg_marquardt(
-            pose, rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), sigmas_px, scale,
+            pose, rig, blocks, points_at, lane_by_lane(blocks, inlier.astype(np.float64)), sigmas_px, scale,
             _MAX_ROUNDS if is_last else 1, _CONVERGED if is_last else _NEAR,
         )  # fmt: skip
     judged = _only(inlier, shows_noise)
     covariance, shared = _covariances(
-        pose, hessian, errors2, rig, blocks, at, inlier, judged, has_right, sigmas_px, scale
+        pose, hessian, errors2, rig, blocks, points_at, inlier, judged, has_right, sigmas_px, scale
     )
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
     return pose, inflation * covariance, inflation * shared, inlier, errors_px
@@ -168,19 +174,19 @@ def _refined_per_image(
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
     """As `_refined`, but at the minimum of eq. (2), of observations image by image (M,) of which some are counted."""
     blocks, pose = in_blocks(images), cur_T_ref
-    at, active = unexpanded(blocks), lane_by_lane(blocks, counted)
+    points_at, active = allocate_points(blocks), lane_by_lane(blocks, counted)
     sigmas_px = np.full(len(images_rig.focal_px), sigma)
     for _ in range(_MAX_REPETITIONS):
         before = pose
         pose, _, _ = _levenberg_marquardt(
-            before, images_rig, blocks, at, active, sigmas_px, scale_px / sigma, _MAX_ROUNDS, _CONVERGED
+            before, images_rig, blocks, points_at, active, sigmas_px, scale_px / sigma, _MAX_ROUNDS, _CONVERGED
         )
         if np.max(np.abs(pose - before)) < _CONVERGED:
             break
     # Inliers and covariance as in `_refined`, with the uncertainty of the triangulated points.
     has_right, blocks, largest2 = observations.has_right, in_blocks(observations), (max_error_px / sigma) ** 2
-    at, sigmas_px = unexpanded(blocks), np.full(len(rig.focal_px), sigma)
-    errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
+    points_at, sigmas_px = allocate_points(blocks), np.full(len(rig.focal_px), sigma)
+    errors2 = _squared_errors(pose, rig, blocks, points_at, sigmas_px)
     inlier = known
     if len(inlier) != len(has_right):
         inlier = errors2 < inlier_cutoff(noise_variance(errors2, has_right, largest2), largest2)
@@ -188,11 +194,11 @@ def _refined_per_image(
     scale = _scale(noise_variance(errors2[inlier], has_right[inlier], largest2), scale_px / sigma)
     hessian = np.empty((6, 6))
     linearise(
-        camera_motions(pose, rig), rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
+        camera_motions(pose, rig), rig, blocks, points_at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
         hessian, np.empty(6), np.empty((len(blocks.pair), POINTS)),
     )  # fmt: skip
     covariance, shared = _covariances(
-        pose, hessian, errors2, rig, blocks, at, inlier, inlier, has_right, sigmas_px, scale
+        pose, hessian, errors2, rig, blocks, points_at, inlier, inlier, has_right, sigmas_px, scale
     )
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
     return pose, inflation * covariance, inflation * shared, inlier, errors_px
@@ -200,8 +206,8 @@ def _refined_per_image(
 
 @kernel
 def _covariances(
-    pose: Float, hessian: Float, errors2: Float, rig: RigArrays, blocks: Blocks, at: Expansion, inlier: Bool,
-    judged: Bool, has_right: Bool, sigmas_px: Float, scale: float,
+    pose: Float, hessian: Float, errors2: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints,
+    inlier: Bool, judged: Bool, has_right: Bool, sigmas_px: Float, scale: float,
 ) -> tuple[Float, Float]:  # fmt: skip
     """Covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`.
 
@@ -218,7 +224,7 @@ def _covariances(
         if inlier[i]:
             factors[i] = influence_slope(errors2[i], has_right[i], scale) ** 2
     through_points = information_through_points(
-        camera_motions(pose, rig), rig, blocks, at, sigmas_px, lane_by_lane(blocks, factors)
+        camera_motions(pose, rig), rig, blocks, points_at, sigmas_px, lane_by_lane(blocks, factors)
     )
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(product(product(used.variance * gain, through_points), gain), root, lower)
@@ -264,25 +270,26 @@ def _bounded(shared: Float, root: Float, lower: Float) -> Float:
 
 @kernel
 def _levenberg_marquardt(
-    cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, active: Float, sigmas_px: Float, scale: float,
-    rounds: int, tolerance: float,
+    cur_T_ref: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, active: Float,
+    sigmas_px: Float, scale: float, rounds: int, tolerance: float,
 ) -> tuple[Float, Float, Float]:  # fmt: skip
     """Minimise the cost; in each round the places at which the points are linearised are found again.
 
     Returns:
         Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum, except for the last step, which is
-        smaller than the tolerance; ``at`` is expanded where the last round began.
+        smaller than the tolerance; ``points_at`` are linearised where the last round began.
     """
     pose = cur_T_ref.copy()
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     for _ in range(rounds):
-        expand(camera_motions(pose, rig), rig, blocks, sigmas_px, at)
+        relinearise_points(camera_motions(pose, rig), rig, blocks, sigmas_px, points_at)
         candidate, cost, damping, moved, length = pose, np.inf, 1e-5, 0.0, 0.0
         for _ in range(1 + _STEPS_PER_ROUND):
             new_cost = linearise(
-                camera_motions(candidate, rig), rig, blocks, at, active, scale, new_hessian, new_gradient, new_errors2
-            )
+                camera_motions(candidate, rig), rig, blocks, points_at, active, scale, new_hessian, new_gradient,
+                new_errors2,
+            )  # fmt: skip
             if new_cost <= cost:
                 pose, cost = candidate, new_cost
                 hessian, new_hessian = new_hessian, hessian
@@ -311,7 +318,7 @@ def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, conf
     sigma, has_right = config.pixel_sigma_px, observations.has_right
     sigmas_px = np.full(len(rig.focal_px), sigma)
     blocks = in_blocks(observations)
-    errors2 = _squared_errors(cur_T_ref, rig, blocks, unexpanded(blocks), sigmas_px)
+    errors2 = _squared_errors(cur_T_ref, rig, blocks, allocate_points(blocks), sigmas_px)
     largest2 = (config.max_error_px / sigma) ** 2
     inlier = errors2 < inlier_cutoff(noise_variance(errors2, has_right, largest2), largest2)
     return np.asarray(inlier), _errors_px(errors2, has_right, sigmas_px[observations.pair])
@@ -327,10 +334,12 @@ def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
 
 
 @kernel
-def _squared_errors(cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float) -> Float:
-    """Compute squared whitened errors (N,), and expand ``at`` there."""
+def _squared_errors(
+    cur_T_ref: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, sigmas_px: Float
+) -> Float:
+    """Compute squared whitened errors (N,), and relinearise ``points_at`` there."""
     motions = camera_motions(cur_T_ref, rig)
-    expand(motions, rig, blocks, sigmas_px, at)
+    relinearise_points(motions, rig, blocks, sigmas_px, points_at)
     errors2 = np.empty((len(blocks.pair), POINTS))
-    linearise(motions, rig, blocks, at, np.zeros_like(errors2), 1.0, np.empty((6, 6)), np.empty(6), errors2)
+    linearise(motions, rig, blocks, points_at, np.zeros_like(errors2), 1.0, np.empty((6, 6)), np.empty(6), errors2)
     return point_by_point(blocks, errors2)
