@@ -17,7 +17,7 @@ from graphvio.errors import RigError
 from graphvio.live.calibration_memory import CalibrationMemory, devices_of, widened
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
-from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
 from graphvio.simulation.default_rig import default_rig
 
 KEPT, LEARNT, OTHER = "kept for the next run of simulator-room", "as learnt by the run of ", "is of another rig file"
@@ -32,7 +32,7 @@ def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def wrong(path: Path, true: Rig, seed: int) -> Path:
-    save_rig(draw(true, CalibrationError.of_level(2), seed).written_rig, path)
+    save_rig(draw(true, CalibrationErrorSizes.of_level(2), seed).written_rig, path)
     return path
 
 
@@ -105,7 +105,7 @@ def test_memory_is_found_by_serial_number_or_by_rig() -> None:
 
 
 def test_memory_of_a_rig_without_serial_number_is_of_that_rig_only(tmp_path: Path) -> None:
-    rig, other = default_rig(), draw(default_rig(), CalibrationError.of_level(1), 0).written_rig
+    rig, other = default_rig(), draw(default_rig(), CalibrationErrorSizes.of_level(1), 0).written_rig
     memory = CalibrationMemory("", rig, tmp_path)
     save_rig(rig, memory.path)
     assert memory.recall() is not None

@@ -14,7 +14,7 @@ from graphvio.evaluation import evaluate
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -96,7 +96,7 @@ def run_with_files_of_long_ago(
 ) -> tuple[list[Estimate], set[str]]:
     """Run a part of the clip by a rig file that is wrong, and an IMU with scale and misalignment."""
     source = open_source(real_clip())
-    error = draw(source.rig, CalibrationError.of_level(3), draw_seed)
+    error = draw(source.rig, CalibrationErrorSizes.of_level(3), draw_seed)
     assert error.true_rig.imu is not None
     rig = replace(error.written_rig, imu=error.true_rig.imu)  # the samples are as they are, and the rig is off
     if cameras is not None:

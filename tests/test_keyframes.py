@@ -21,7 +21,7 @@ from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.odometry.step import NewKeyframe, Step
 from graphvio.rig import Rig
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.simulator import make_simulator
 from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
@@ -111,7 +111,7 @@ def test_each_reference_is_a_keyframe_with_the_next_id(run: Run) -> None:
 
 
 def test_landmarks_are_those_of_the_calibration_in_force(run: Run, rig: Rig, measurements: list[Measurement]) -> None:
-    error = CalibrationError.of_level(3, ["left-right-rotation", "principal-point", "pair-transform"])
+    error = CalibrationErrorSizes.of_level(3, ["left-right-rotation", "principal-point", "pair-transform"])
     wrong = draw(rig, error, seed=1).written_rig
     newest = run_of(wrong, until(measurements, 80)).keyframes[-1]
     assert run.keyframes[-1].calibrated_rig is None  # the file is exact

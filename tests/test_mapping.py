@@ -22,7 +22,7 @@ from graphvio.mapping import saved_map
 from graphvio.mapping.mapper import Mapper
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory_files import load_trajectory, save_trajectory
 
@@ -105,7 +105,9 @@ class Calibrated(SyntheticFrontEnd):
     """Has a rig file that is wrong, and keyframes that have the true one."""
 
     def __init__(self, rig: Rig, *others: Any) -> None:
-        wrong = draw(rig, CalibrationError.of_level(3, ["left-right-rotation", "pair-transform"]), seed=1).written_rig
+        wrong = draw(
+            rig, CalibrationErrorSizes.of_level(3, ["left-right-rotation", "pair-transform"]), seed=1
+        ).written_rig
         super().__init__(wrong, *others)
         self._true_rig = rig
 

@@ -47,7 +47,7 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, has_coefficient, moved_cameras
 from graphvio.self_calibration.prior import file_prior
 from graphvio.simulation import default_rig
-from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
 from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
 from graphvio.slam.service.convert import keyframe_message, keyframe_of
@@ -709,7 +709,7 @@ def test_an_epoch_after_the_dark_begins_with_the_calibration_that_was_learnt() -
 
 def wrong_by(rig: Rig, seed: int, level: int = 2) -> tuple[Float, Rig]:
     """Return the difference of a rig from a file that is wrong by a level's standard deviations, and the file."""
-    sampled = draw(rig, CalibrationError.of_level(level, ["focal", "principal-point", "pair-transform"]), seed)
+    sampled = draw(rig, CalibrationErrorSizes.of_level(level, ["focal", "principal-point", "pair-transform"]), seed)
     written = sampled.written_rig
     difference = []
     for camera, true in zip(written.cameras, rig.cameras, strict=True):
@@ -885,7 +885,7 @@ def test_run_without_pairs_by_a_wrong_file_writes_what_it_learnt_and_the_next_ru
     stereo_and_back_walk: Path, tmp_path: Path
 ) -> None:
     true = load_rig(stereo_and_back_walk)
-    error = CalibrationError.of_level(3, ["principal-point", "pair-transform", "cameras-in-body"])
+    error = CalibrationErrorSizes.of_level(3, ["principal-point", "pair-transform", "cameras-in-body"])
     save_rig(draw(true, error, 1).written_rig, tmp_path / "wrong.yaml")
     errors_mm = []
     for rig, out in (("wrong.yaml", "first"), ("first/rig-refined.yaml", "second")):

@@ -17,7 +17,7 @@ from graphvio.measurements.events import EventKind
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.window import Keyframe
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe as SlamKeyframe
 from graphvio.trajectory import Trajectory
@@ -108,7 +108,7 @@ def test_path_with_a_wrong_attitude_of_the_cameras_in_body_does_not_bend(
     exact = open_source(walk)
     assert exact.truth is not None
     truth = load_trajectory(exact.truth)
-    written = draw(exact.rig, CalibrationError.of_level(3, ["cameras-in-body"]), seed).written_rig
+    written = draw(exact.rig, CalibrationErrorSizes.of_level(3, ["cameras-in-body"]), seed).written_rig
     odometry = Odometry(written)
     front_end, keyframes = FrontEnd(odometry), list[SlamKeyframe]()
     front_end.on_keyframe(keyframes.append)

@@ -35,7 +35,7 @@ from graphvio.optimization.optimize import optimize
 from graphvio.optimization.pipeline import DATABASE, Session, Stages, optimize_sessions
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.rig_files import load_rig, save_rig
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
@@ -280,7 +280,7 @@ def test_optimize_exact_file_stays(short_walk: Path, done: Path) -> None:
 
 @pytest.mark.usefixtures("without_plots")
 def test_optimize_wrong_file_is_calibrated_first(walk: Path, tmp_path: Path) -> None:
-    wrong = draw(open_source(walk).rig, CalibrationError.of_level(3, ["left-right-rotation"]), seed=1).written_rig
+    wrong = draw(open_source(walk).rig, CalibrationErrorSizes.of_level(3, ["left-right-rotation"]), seed=1).written_rig
     save_rig(wrong, tmp_path / "wrong.yaml")
     (tmp_path / "as_it_is.yaml").write_text("calibration: {online: false}")
     errors = {}

@@ -25,8 +25,7 @@ from graphvio.self_calibration.batch import Batch, calibrate_windows, difference
 from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO
-from graphvio.simulation.calibration_error import CalibrationError as CalibrationErrors
-from graphvio.simulation.calibration_error import calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
 from graphvio.simulation.default_rig import default_rig
 from graphvio.sources import open_source
 
@@ -61,7 +60,7 @@ def rms(rig: Rig, true: Rig) -> dict[str, float]:
 def test_batch_is_as_wrong_as_its_covariance_says() -> None:
     true = default_rig().without_imu()
     for seed in (0, 1):
-        written = draw(true, CalibrationErrors.of_level(2, OF_CAMERAS), seed).written_rig.without_imu()
+        written = draw(true, CalibrationErrorSizes.of_level(2, OF_CAMERAS), seed).written_rig.without_imu()
         batch = batch_of(written, windows_of(written, true, seed))
         before, after = rms(written, true), rms(batch.estimate.rig, true)
         for name, share in (("principal_point_px", 0.5), ("left_right_deg", 0.2), ("pair_transform_deg", 0.2)):
@@ -78,7 +77,7 @@ def test_batch_is_as_wrong_as_its_covariance_says() -> None:
 
 def test_halves_of_one_rig_agree_and_those_of_two_do_not() -> None:
     rig = default_rig().without_imu()
-    knocked = draw(rig, CalibrationErrors.of_level(2, ["left-right-rotation"]), 4).written_rig.without_imu()
+    knocked = draw(rig, CalibrationErrorSizes.of_level(2, ["left-right-rotation"]), 4).written_rig.without_imu()
     first, second, other = (
         batch_of(rig, windows_of(rig, true, seed)) for true, seed in ((rig, 0), (rig, 1), (knocked, 2))
     )
@@ -97,7 +96,7 @@ def test_halves_of_one_rig_agree_and_those_of_two_do_not() -> None:
 
 def test_calibrate_recording_finds_all_parameters(walk: Path) -> None:
     source, true = open_source(walk, to_s=9.0), load_rig(walk)
-    written = draw(true, CalibrationErrors.of_level(2, [*OF_CAMERAS, "cameras-in-body"]), 1).written_rig
+    written = draw(true, CalibrationErrorSizes.of_level(2, [*OF_CAMERAS, "cameras-in-body"]), 1).written_rig
     found = calibrate_recording(source, written)
     before, after = rms(written, true), rms(found.rig, true)
     for name, share in (
@@ -115,7 +114,7 @@ def test_calibrate_recording_finds_all_parameters(walk: Path) -> None:
 def test_calibrate_recording_of_single_cameras_finds_lenses_and_places(walk: Path) -> None:
     true = load_rig(walk).with_only(["0", "1", "2"]).without_pairs()
     written = draw(
-        true, CalibrationErrors.of_level(2, ["principal-point", "cameras-in-body", "time-offset"]), 1
+        true, CalibrationErrorSizes.of_level(2, ["principal-point", "cameras-in-body", "time-offset"]), 1
     ).written_rig
     found = calibrate_recording(open_source(walk, written, to_s=9.0), written)
     before, after = rms(written, true), rms(found.rig, true)
@@ -137,7 +136,7 @@ def test_command_left_to_right_of_single_cameras_is_refused(walk: Path) -> None:
 
 def test_calibrate_recording_of_one_group_keeps_the_others(walk: Path) -> None:
     source, true = open_source(walk, to_s=8.0), load_rig(walk)
-    written = draw(true, CalibrationErrors.of_level(2, ["left-right-rotation", "pair-transform"]), 2).written_rig
+    written = draw(true, CalibrationErrorSizes.of_level(2, ["left-right-rotation", "pair-transform"]), 2).written_rig
     found = calibrate_recording(source, written, "stereo")
     before, after = rms(written, true), rms(found.rig, true)
     assert after["left_right_deg"] < 0.2 * before["left_right_deg"]
@@ -180,7 +179,9 @@ def command(*arguments: object) -> Result:
 
 def test_command_writes_rig_and_report(walk: Path, tmp_path: Path) -> None:
     true = load_rig(walk)
-    save_rig(draw(true, CalibrationErrors.of_level(2, ["left-right-rotation"]), 3).written_rig, tmp_path / "rig.yaml")
+    save_rig(
+        draw(true, CalibrationErrorSizes.of_level(2, ["left-right-rotation"]), 3).written_rig, tmp_path / "rig.yaml"
+    )
     out, report = tmp_path / "out.yaml", tmp_path / "report"
     done = command(walk, "--rig", tmp_path / "rig.yaml", "--what", "all", "--out", out, "--report", report)
     assert done.exit_code == 0, done.output

@@ -42,7 +42,7 @@ from graphvio.self_calibration.parameters import (
 from graphvio.self_calibration.prior import file_prior
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.motion import Motion
 
@@ -243,7 +243,7 @@ def angles_deg(one: Float, other: Float) -> Float:
 
 
 def sampled(level: int, seed: int) -> tuple[Rig, Rig, object]:
-    error = draw(default_rig(), CalibrationError.of_level(level, CAMERAS), seed)
+    error = draw(default_rig(), CalibrationErrorSizes.of_level(level, CAMERAS), seed)
     return error.written_rig.without_imu(), error.true_rig.without_imu(), error.imu
 
 
@@ -389,7 +389,7 @@ def test_self_calibration_leaves_out_what_cannot_be_solved(failure: str, monkeyp
 def test_self_calibration_leaves_out_windows_whose_adjustment_has_not_converged(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    error = draw(default_rig().without_imu(), CalibrationError.of_level(3, CAMERAS), 0)
+    error = draw(default_rig().without_imu(), CalibrationErrorSizes.of_level(3, CAMERAS), 0)
     monkeypatch.setattr(solver, "_MAX_STEPS", 1)
     found = calibrated(SelfCalibration(error.written_rig), Walk(error.true_rig), 3.0)
     assert not found.has_full_window
@@ -466,7 +466,7 @@ def test_self_calibration_repeats_to_the_bit() -> None:
 
 
 def test_self_calibration_with_imu_finds_time_offset_and_cameras_in_body() -> None:
-    error = draw(default_rig(), CalibrationError.of_level(2, ["cameras-in-body", "time-offset"]), 3)
+    error = draw(default_rig(), CalibrationErrorSizes.of_level(2, ["cameras-in-body", "time-offset"]), 3)
     walk = Walk(error.true_rig, scene="calibration")
     assert error.true_rig.imu is not None
     assert error.written_rig.imu is not None
@@ -488,7 +488,7 @@ def test_self_calibration_with_an_imu_that_begins_with_the_images_finds_a_time_o
 ) -> None:
     # They end with the newest keyframe, or begin with the first one, and do not cover it by the offset that is found.
     for seed in range(4):
-        error = draw(default_rig(), CalibrationError.of_level(3, CAMERAS), seed)
+        error = draw(default_rig(), CalibrationErrorSizes.of_level(3, CAMERAS), seed)
         assert error.true_rig.imu is not None
         true = replace(error.true_rig, imu=replace(error.true_rig.imu, time_offset_s=1e-3 * offset_ms))
         found = calibrated(SelfCalibration(error.written_rig), Walk(true, seed=seed), 1.0).estimate
@@ -500,7 +500,7 @@ def test_self_calibration_whose_steps_were_refused_does_not_claim_to_know_the_ca
     components = [*CAMERAS, "cameras-in-body", "time-offset", "imu-noise"]
     in_body, distances2 = slice(BODY, BODY + 3), []
     for seed in range(6):
-        error = draw(default_rig(), CalibrationError.of_level(2, components), seed)
+        error = draw(default_rig(), CalibrationErrorSizes.of_level(2, components), seed)
         walk = Walk(error.true_rig, seed=seed)
         found = calibrated(SelfCalibration(error.written_rig), walk, 3.0).estimate.posterior
         off = found.mean[in_body] - true_difference(error.written_rig, error.true_rig)[in_body]
@@ -552,7 +552,7 @@ class Flight(Walk):
 
 def test_adjusted_window_of_far_points_does_not_keep_the_scale_of_the_first_poses() -> None:
     # The odometry measured its motions with a left-right rotation that is off by a tenth of a pixel.
-    error = draw(default_rig(), CalibrationError.of_level(2, ["left-right-rotation"]), 0)
+    error = draw(default_rig(), CalibrationErrorSizes.of_level(2, ["left-right-rotation"]), 0)
     written, walk = error.written_rig, Flight(error.true_rig)
     keyframes = [Keyframe(*frameset) for frameset in walk.framesets(6.0)][5::5]
     collector = WindowCollector(written)
@@ -584,7 +584,7 @@ def test_adjustments_of_points_that_are_nearly_infinite_converge(
 
     monkeypatch.setattr(online, "adjusted", keep)
     for seed in (1, 2, 3):
-        error = draw(default_rig(), CalibrationError.of_level(3, CAMERAS), seed)
+        error = draw(default_rig(), CalibrationErrorSizes.of_level(3, CAMERAS), seed)
         calibrated(SelfCalibration(error.written_rig), Flight(error.true_rig, seed=seed, farther=farther), 2.5)
     assert len(solutions) > 10
     assert all(solution.has_converged for solution in solutions)
@@ -594,7 +594,7 @@ def test_adjustments_of_points_that_are_nearly_infinite_converge(
 
 
 def test_findings_name_what_is_wrong_and_only_that() -> None:
-    error = draw(default_rig(), CalibrationError.of_level(3, ["left-right-rotation"]), 1)
+    error = draw(default_rig(), CalibrationErrorSizes.of_level(3, ["left-right-rotation"]), 1)
     written, true = error.written_rig.without_imu(), error.true_rig.without_imu()
     wrong = calibrated(SelfCalibration(written), Walk(true), 10.0).findings()
     assert {finding.part for finding in wrong if finding.is_significant} == {

@@ -10,7 +10,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import PAIR, SINGLE, moved_cameras, n_of_cameras, parameter_names
 from graphvio.self_calibration.window import inverse_depths_of_tracks
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.named_rigs import stereo_and_back
 
 CAMERAS = ["focal", "principal-point", "distortion", "left-right-rotation", "baseline", "pair-transform"]
@@ -25,7 +25,7 @@ def angle_deg(one: Float, other: Float) -> float:
 
 
 def sampled(level: int, seed: int) -> tuple[Rig, Rig]:
-    error = draw(stereo_and_back(), CalibrationError.of_level(level, CAMERAS), seed)
+    error = draw(stereo_and_back(), CalibrationErrorSizes.of_level(level, CAMERAS), seed)
     return error.written_rig.without_imu(), error.true_rig.without_imu()
 
 

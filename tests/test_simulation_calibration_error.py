@@ -18,7 +18,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files import load_rig
 from graphvio.simulation import (
     RIG_CHANGES,
-    CalibrationError,
+    CalibrationErrorSizes,
     SimulatedRecording,
     Simulator,
     build_scene,
@@ -34,7 +34,7 @@ DURATION_S = 0.4
 RIG_FIELDS = [name for names in COMPONENTS.values() for name in names if not name.startswith("imu_")]
 
 
-def differences(error: CalibrationError, seed: int) -> dict[str, Float]:
+def differences(error: CalibrationErrorSizes, seed: int) -> dict[str, Float]:
     sampled = draw(default_rig(), error, seed)
     return calibration_differences(sampled.written_rig, sampled.true_rig)
 
@@ -52,7 +52,7 @@ def assert_rms(values: Float, sigma: float) -> None:
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_draw_many_seeds_errors_have_the_sizes_of_the_level(level: int) -> None:
-    error = CalibrationError.of_level(level)
+    error = CalibrationErrorSizes.of_level(level)
     found = [differences(error, seed) for seed in range(DRAWS)]
     for name in RIG_FIELDS:
         values = np.array([each[name] for each in found])
@@ -64,7 +64,7 @@ def test_draw_many_seeds_errors_have_the_sizes_of_the_level(level: int) -> None:
 
 
 def test_draw_many_seeds_imu_matrices_have_their_sizes() -> None:
-    error = CalibrationError.of_level(3)
+    error = CalibrationErrorSizes.of_level(3)
     sampled = [draw(default_rig(), error, seed).imu for seed in range(DRAWS)]
     off_diagonal = ~np.eye(3, dtype=bool)
     for matrices in (
@@ -76,7 +76,7 @@ def test_draw_many_seeds_imu_matrices_have_their_sizes() -> None:
 
 
 def test_draw_focal_error_is_common_to_both_axes_of_a_camera() -> None:
-    sampled = draw(default_rig(), CalibrationError.of_level(2), 1)
+    sampled = draw(default_rig(), CalibrationErrorSizes.of_level(2), 1)
     pairs = zip(sampled.written_rig.cameras, sampled.true_rig.cameras, strict=True)
     ratios = np.array([written.intrinsics[:2] / true.intrinsics[:2] for written, true in pairs])
     np.testing.assert_allclose(ratios[:, 0], ratios[:, 1], rtol=1e-12)
@@ -85,7 +85,7 @@ def test_draw_focal_error_is_common_to_both_axes_of_a_camera() -> None:
 
 @pytest.mark.parametrize("component", COMPONENTS)
 def test_draw_one_component_is_as_among_all_and_leaves_others_exact(component: str) -> None:
-    alone, everything = CalibrationError.of_level(2, [component]), CalibrationError.of_level(2)
+    alone, everything = CalibrationErrorSizes.of_level(2, [component]), CalibrationErrorSizes.of_level(2)
     one, whole = differences(alone, 7), differences(everything, 7)
     for name in RIG_FIELDS:
         if name in COMPONENTS[component]:
@@ -97,7 +97,7 @@ def test_draw_one_component_is_as_among_all_and_leaves_others_exact(component: s
 
 def test_draw_without_error_changes_nothing() -> None:
     rig = default_rig()
-    sampled = draw(rig, CalibrationError(), 3)
+    sampled = draw(rig, CalibrationErrorSizes(), 3)
     assert sampled.written_rig.imu == sampled.true_rig.imu == rig.imu
     for name, values in calibration_differences(sampled.written_rig, rig).items():
         np.testing.assert_allclose(values, 0.0, atol=1e-9, err_msg=name)
@@ -107,7 +107,7 @@ def test_draw_without_error_changes_nothing() -> None:
 
 def test_draw_true_rig_has_the_true_cameras_and_the_true_imu() -> None:
     rig = default_rig()
-    sampled = draw(rig, CalibrationError.of_level(3), 2)
+    sampled = draw(rig, CalibrationErrorSizes.of_level(3), 2)
     assert sampled.true_rig.pairs == rig.pairs
     assert sampled.written_rig.imu == rig.imu
     assert sampled.true_rig.imu is not None
@@ -118,7 +118,7 @@ def test_draw_true_rig_has_the_true_cameras_and_the_true_imu() -> None:
 
 
 def test_draw_levels_of_one_seed_have_one_direction() -> None:
-    first, third = (differences(CalibrationError.of_level(level), 4) for level in (1, 3))
+    first, third = (differences(CalibrationErrorSizes.of_level(level), 4) for level in (1, 3))
     for name in ("principal_point_px", "focal_percent", "baseline_percent", "left_right_deg"):
         np.testing.assert_allclose(third[name], 10.0 * first[name], rtol=1e-6)
 
@@ -126,12 +126,12 @@ def test_draw_levels_of_one_seed_have_one_direction() -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: CalibrationError(focal_percent=-0.1),
-        lambda: CalibrationError(time_offset_ms=float("nan")),
-        lambda: CalibrationError(imu_noise_factor=0.0),
-        lambda: CalibrationError.of_level(4),
-        lambda: CalibrationError.of_level(2, ["lens"]),
-        lambda: draw(default_rig(), CalibrationError(), -1),
+        lambda: CalibrationErrorSizes(focal_percent=-0.1),
+        lambda: CalibrationErrorSizes(time_offset_ms=float("nan")),
+        lambda: CalibrationErrorSizes(imu_noise_factor=0.0),
+        lambda: CalibrationErrorSizes.of_level(4),
+        lambda: CalibrationErrorSizes.of_level(2, ["lens"]),
+        lambda: draw(default_rig(), CalibrationErrorSizes(), -1),
     ],
 )
 def test_calibration_error_impossible_value_is_refused(make: Callable[[], object]) -> None:
@@ -147,7 +147,7 @@ def test_measure_imu_error_multiplies_rates_and_forces_and_shifts_stamps() -> No
     motion = build_scene("room", 3.0, 0.0).motion
     times_s = np.linspace(0.0, 3.0, 601)
     stamps_ns = np.round(1e9 * times_s).astype(np.int64)
-    sampled = draw(default_rig(), CalibrationError.of_level(3), 5)
+    sampled = draw(default_rig(), CalibrationErrorSizes.of_level(3), 5)
     assert sampled.written_rig.imu is not None
     assert sampled.true_rig.imu is not None
     exact = measure(motion, sampled.written_rig.imu, times_s, stamps_ns, 1)
@@ -174,7 +174,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedRecor
     """One with exact files, and one with wrong files."""
     folder = tmp_path_factory.mktemp("calibration-error")
     exact = simulate("room", folder / "exact", duration_s=DURATION_S, seed=2, rate_hz=10.0)
-    error = CalibrationError.of_level(2)
+    error = CalibrationErrorSizes.of_level(2)
     wrong = simulate(
         "room",
         folder / "wrong",
@@ -213,7 +213,7 @@ def test_simulate_calibration_error_files_are_wrong_and_the_true_ones_beside(
     recordings: tuple[SimulatedRecording, SimulatedRecording],
 ) -> None:
     _, wrong = recordings
-    sampled = draw(default_rig(), CalibrationError.of_level(2), 9)
+    sampled = draw(default_rig(), CalibrationErrorSizes.of_level(2), 9)
     for file in ("rig.yaml", "mav0/cam0/sensor.yaml"):
         assert_same_cameras(load_rig(wrong.path / file), sampled.written_rig)
     assert load_rig(wrong.path).imu == sampled.written_rig.imu
@@ -291,7 +291,7 @@ def test_command_with_one_component_writes_a_rig_that_is_wrong_in_it_alone(tmp_p
     )
     assert result.exit_code == 0, result.output
     found = calibration_differences(load_rig(out), load_rig(out / "rig-true.yaml"))
-    expected = differences(CalibrationError.of_level(2, ["focal"]), 3)
+    expected = differences(CalibrationErrorSizes.of_level(2, ["focal"]), 3)
     np.testing.assert_allclose(found["focal_percent"], expected["focal_percent"], atol=1e-9)
     np.testing.assert_allclose(found["principal_point_px"], 0.0, atol=1e-9)
 

@@ -20,7 +20,7 @@ from graphvio.results.summary import Summary
 from graphvio.rig import Rig, SingleCamera, overlap
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.sessions.euroc_writer import EurocWriter
-from graphvio.simulation import CalibrationError
+from graphvio.simulation import CalibrationErrorSizes
 from graphvio.simulation.calibration_error import draw
 from graphvio.simulation.named_rigs import NAMED_RIGS, stereo_and_back
 from graphvio.sources import open_source
@@ -232,6 +232,6 @@ def test_frameset_with_the_wrong_number_of_images_is_refused(walk: Path) -> None
 
 def test_calibration_error_of_a_rig_with_a_single_camera_is_on_it_too() -> None:
     rig = stereo_and_back()
-    written = draw(rig, CalibrationError.of_level("2"), 3).written_rig
+    written = draw(rig, CalibrationErrorSizes.of_level("2"), 3).written_rig
     assert not np.allclose(written.singles[0].left.body_T_cam, rig.singles[0].left.body_T_cam, atol=1e-4)
     assert not np.allclose(written.singles[0].left.intrinsics, rig.singles[0].left.intrinsics, atol=1e-2)

@@ -65,12 +65,12 @@ import sys
 from test_warmup import compiled
 from graphvio import ImuSample, Odometry, open_source
 from graphvio.config import Config
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.slam import FrontEnd
 from graphvio.warmup import warm_up
 
 which, recording = sys.argv[1:]
-rig = draw(open_source(recording).rig, CalibrationError.of_level(3, ["pair-transform"]), 1).written_rig
+rig = draw(open_source(recording).rig, CalibrationErrorSizes.of_level(3, ["pair-transform"]), 1).written_rig
 if which in ("singles", "pair_and_single"):
     rig = rig.with_only(["0", "1", "2"])
 rig = {"singles": rig.without_pairs, "without_imu": rig.without_imu}.get(which, lambda: rig)()

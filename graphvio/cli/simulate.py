@@ -99,13 +99,13 @@ def simulate(
 
         graphvio simulate street --out street
     """
-    from graphvio.simulation import CalibrationError
+    from graphvio.simulation import CalibrationErrorSizes
     from graphvio.simulation import simulate as simulate_recording
     from graphvio.simulation.named_rigs import rig_of
 
     error = None
     if calibration_error is not None:
-        error = CalibrationError.of_level(calibration_error, calibration_component)
+        error = CalibrationErrorSizes.of_level(calibration_error, calibration_component)
     elif calibration_component or calibration_seed is not None:
         raise typer.BadParameter("--calibration-component and --calibration-seed need --calibration-error LEVEL")
     true_rig = None

@@ -3,7 +3,7 @@
 `simulate` writes a recording; `make_simulator` yields the same images, IMU samples and truth in memory.
 """
 
-from graphvio.simulation.calibration_error import CalibrationError
+from graphvio.simulation.calibration_error import CalibrationErrorSizes
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.recording import SimulatedRecording, simulate, write_recording
 from graphvio.simulation.rig_change import RIG_CHANGES
@@ -13,7 +13,7 @@ from graphvio.simulation.simulator import Simulator, make_simulator
 __all__ = [
     "RIG_CHANGES",
     "SCENE_NAMES",
-    "CalibrationError",
+    "CalibrationErrorSizes",
     "SimulatedRecording",
     "Simulator",
     "build_scene",

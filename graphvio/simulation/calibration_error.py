@@ -23,7 +23,7 @@ _STREAM = 3  # of the seed: 1 is the IMU's noise, 2 that of images
 
 
 @dataclass(frozen=True)
-class CalibrationError:
+class CalibrationErrorSizes:
     """Sizes of calibration errors; standard deviations, unless something else is said. The default is no error.
 
     Attributes:
@@ -65,7 +65,7 @@ class CalibrationError:
                 raise SourceError(f"calibration error: {name} is {value}; give a finite number that is not negative")
 
     @staticmethod
-    def of_level(level: int | str, components: Sequence[str] | None = None) -> CalibrationError:
+    def of_level(level: int | str, components: Sequence[str] | None = None) -> CalibrationErrorSizes:
         """Return the errors of one of `LEVELS`.
 
         Args:
@@ -87,7 +87,7 @@ class CalibrationError:
             if name not in COMPONENTS:
                 raise SourceError(f"no calibration error has the name {name!r}; choose from {', '.join(COMPONENTS)}")
         kept = [each for name in components for each in COMPONENTS[name]]
-        return CalibrationError(**{name: getattr(known, name) for name in kept})
+        return CalibrationErrorSizes(**{name: getattr(known, name) for name in kept})
 
 
 COMPONENTS: dict[str, tuple[str, ...]] = {
@@ -103,14 +103,14 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
     "imu-misalignment": ("imu_misalignment_deg",),
     "imu-noise": ("imu_noise_factor",),
 }
-"""Component -> fields of `CalibrationError`."""
+"""Component -> fields of `CalibrationErrorSizes`."""
 
 
 def _level(
     factor: float, time_offset_ms: float, scale_percent: float, misalignment_deg: float, noise: float
-) -> CalibrationError:
+) -> CalibrationErrorSizes:
     """Return the errors of a level: cameras have a multiple of those of level 2."""
-    return CalibrationError(
+    return CalibrationErrorSizes(
         focal_percent=factor * 0.1,
         principal_point_px=factor * 0.5,
         distortion_percent=factor * 0.5,
@@ -133,7 +133,7 @@ _LEVELS = {
     3: _level(3.0, 8.0, 1.0, 0.5, 2.2),
 }
 LEVELS = tuple(_LEVELS)
-"""Levels of `CalibrationError.of_level`: a careful calibration, a usual one, and one of long ago."""
+"""Levels of `CalibrationErrorSizes.of_level`: a careful calibration, a usual one, and one of long ago."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ class SampledError:
     imu: ImuError
 
 
-def draw(rig: Rig, error: CalibrationError, seed: int) -> SampledError:
+def draw(rig: Rig, error: CalibrationErrorSizes, seed: int) -> SampledError:
     """Draw a calibration error.
 
     Args:
@@ -232,9 +232,9 @@ def calibration_differences(rig: Rig, true_rig: Rig) -> dict[str, Float]:
         true_rig: of the same cameras.
 
     Returns:
-        Name with unit, as in `CalibrationError` -> errors (K,) of all cameras, pairs and axes. Without an IMU in both
-        rigs there is no ``time_offset_ms``, without pairs nothing from left to right, and without a second pair, or
-        another single camera, nothing about its place.
+        Name with unit, as in `CalibrationErrorSizes` -> errors (K,) of all cameras, pairs and axes. Without an IMU in
+        both rigs there is no ``time_offset_ms``, without pairs no stereo extrinsics, and without a second pair, or
+        another single camera, none of its extrinsics.
     """
     cameras = list(zip(rig.cameras, true_rig.cameras, strict=True))
     ratios = np.array([camera.intrinsics[:2] / true.intrinsics[:2] for camera, true in cameras])

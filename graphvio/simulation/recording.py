@@ -21,7 +21,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
-from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.simulation.rig_change import RIG_CHANGES
 from graphvio.simulation.scenes import build_scene
@@ -67,7 +67,7 @@ def simulate(
     rate_hz: float | Sequence[float] | None = None,
     stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
-    calibration_error: CalibrationError | None = None,
+    calibration_error: CalibrationErrorSizes | None = None,
     calibration_seed: int | None = None,
     rig_change: str | None = None,
     rig: Rig | None = None,

@@ -18,7 +18,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.rig import Rig
 from graphvio.simulation import RIG_CHANGES, SCENE_NAMES
-from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationError
+from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationErrorSizes
 from graphvio.sources import open_source
 
 _SCENES = ("room", "corridor", "stairs", "calibration")
@@ -142,8 +142,8 @@ def _rendered(args: argparse.Namespace, scene: str) -> Path:
     return folder
 
 
-def _error(level: int, components: Sequence[str] | None) -> CalibrationError:
-    return CalibrationError() if level == EXACT else CalibrationError.of_level(level, components)
+def _error(level: int, components: Sequence[str] | None) -> CalibrationErrorSizes:
+    return CalibrationErrorSizes() if level == EXACT else CalibrationErrorSizes.of_level(level, components)
 
 
 def _config(profile: str, assignments: Sequence[str]) -> Config:

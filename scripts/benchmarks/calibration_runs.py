@@ -20,7 +20,7 @@ from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.simulation import RIG_CHANGES, make_simulator
-from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
 from graphvio.sources import open_source
 from graphvio.sources.sequencer import merge
 from graphvio.trajectory import Trajectory
@@ -74,7 +74,7 @@ class WronglyCalibrated:
         scene: str,
         duration_s: float | None,
         rig_change: str | None,
-        error: CalibrationError,
+        error: CalibrationErrorSizes,
         seed: int,
     ) -> None:
         self._folder, self._duration_s = folder, duration_s

@@ -28,7 +28,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.measurements.events import EventKind
 from graphvio.simulation import simulate
-from graphvio.simulation.calibration_error import LEVELS, CalibrationError
+from graphvio.simulation.calibration_error import LEVELS, CalibrationErrorSizes
 from graphvio.sources import open_source
 from graphvio.trajectory_files import load_trajectory
 
@@ -128,7 +128,7 @@ def _run(args: argparse.Namespace, seed: int) -> list[_Result]:
     positions, results = load_trajectory(truth).nav_T_body[:, :3, 3], []
     path_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     for level in (EXACT, LEVELS[seed % len(LEVELS)]):
-        error = CalibrationError() if level == EXACT else CalibrationError.of_level(level)
+        error = CalibrationErrorSizes() if level == EXACT else CalibrationErrorSizes.of_level(level)
         walk = WronglyCalibrated(folder, sampled.scene, args.duration, None, error, seed)
         results.append(_Result(seed, sampled, level, path_m, walk.run(Config.load("default"), lambda rig: rig)))
     return results

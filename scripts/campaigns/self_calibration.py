@@ -22,7 +22,7 @@ from graphvio.errors import GraphvioError
 from graphvio.self_calibration.imu_model import PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
-from graphvio.simulation.calibration_error import LEVELS, CalibrationError, draw
+from graphvio.simulation.calibration_error import LEVELS, CalibrationErrorSizes, draw
 from graphvio.simulation.default_rig import default_rig
 
 _COMPONENTS = (
@@ -82,7 +82,7 @@ def main(args: argparse.Namespace) -> None:
 
 def _one_run(seed: int, level: int, duration_s: float) -> _Run:
     """Let a calibration see a walk, and compare what it found with the truth."""
-    sampled = draw(default_rig(), CalibrationError.of_level(level, list(_COMPONENTS)), seed)
+    sampled = draw(default_rig(), CalibrationErrorSizes.of_level(level, list(_COMPONENTS)), seed)
     written, true = sampled.written_rig, sampled.true_rig
     found = calibrated(SelfCalibration(written), Walk(true, seed=seed), duration_s).estimate
     assert written.imu is not None
