@@ -47,7 +47,7 @@ _NS_PER_S = 1e9
 
 
 @dataclass(frozen=True)
-class LoopClosure:
+class LoopClosureError:
     """Error of the displacement from start to end, in metres and in percent of the path."""
 
     error_m: float
@@ -89,7 +89,7 @@ class Evaluation:
     ate_percent: float | None
     drift_m: float
     drift_percent: float | None
-    loop_closure: LoopClosure | None
+    loop_closure: LoopClosureError | None
     rpe: Mapping[str, RelativeError]
     kitti_percent: float | None
     kitti_deg_per_m: float | None
@@ -218,12 +218,12 @@ def _drift(estimate: Trajectory, truth: Trajectory) -> float:
     return float(np.linalg.norm(end - truth.positions[-1]))
 
 
-def _loop_closure(aligned: Trajectory, truth: Trajectory, path_m: float) -> LoopClosure | None:
+def _loop_closure(aligned: Trajectory, truth: Trajectory, path_m: float) -> LoopClosureError | None:
     true_displacement = truth.positions[-1] - truth.positions[0]
     if np.linalg.norm(true_displacement) > _MAX_LOOP_GAP_M or path_m < _MIN_LOOP_PATH_M:
         return None
     error_m = float(np.linalg.norm(aligned.positions[-1] - aligned.positions[0] - true_displacement))
-    return LoopClosure(error_m, 100.0 * error_m / path_m)
+    return LoopClosureError(error_m, 100.0 * error_m / path_m)
 
 
 def _why_not_associated(estimate: Trajectory, truth: Trajectory, associated: int, max_gap_s: float) -> str:
