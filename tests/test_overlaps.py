@@ -16,7 +16,7 @@ from graphvio.frontend.singles import SinglesFrontend
 from graphvio.rig import Camera, Rig, axes_angle_deg, overlap
 from graphvio.simulation import Simulator, build_scene, default_rig
 from graphvio.simulation.named_rigs import headset, phone, surround
-from graphvio.simulation.renderer import View
+from graphvio.simulation.renderer import RenderedView
 from graphvio.simulation.surfaces import Surfaces
 
 
@@ -37,9 +37,9 @@ class OnceRendered(Simulator):
 
     _index = -1
 
-    def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> View:
+    def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> RenderedView:
         if index != self._index:
-            self._index, self._views = index, dict[int, View]()
+            self._index, self._views = index, dict[int, RenderedView]()
         if camera not in self._views:
             self._views[camera] = super().view(index, camera, surfaces)
         return self._views[camera]

@@ -31,7 +31,7 @@ _MAX_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TrackedImage:
     """The newest image of a camera, and what is tracked in it.
 
     Attributes:
@@ -94,7 +94,7 @@ class Overlaps:
     def find(
         self,
         camera: int,
-        views: Mapping[int, View],
+        views: Mapping[int, TrackedImage],
         cam_T_before: Callable[[int], Float | None],
         searches: bool,
         wanted: Bool | None = None,
@@ -161,8 +161,8 @@ class Overlaps:
     def _find(
         self,
         partner: _Partner,
-        own: View,
-        other: View,
+        own: TrackedImage,
+        other: TrackedImage,
         cam_T_before: Callable[[int], Float | None],
         searches: bool,
         wanted: Bool | None,

@@ -16,7 +16,7 @@ from graphvio.frontend.lost_tracks import image_shift, motion_of_found
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
-from graphvio.frontend.overlaps import View
+from graphvio.frontend.overlaps import TrackedImage
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines
 from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
@@ -162,9 +162,9 @@ class PairTracker:
         return self._last, which[np.isin(ids, new.ids)]
 
     @property
-    def view(self) -> View:
+    def view(self) -> TrackedImage:
         """The newest left image, and what is tracked in it."""
-        return View(self._last, self._left, self._allowed, self._min_gradient)
+        return TrackedImage(self._last, self._left, self._allowed, self._min_gradient)
 
     @property
     def are_lines_off(self) -> bool:

@@ -28,7 +28,7 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.features import PlaceObserver
 from graphvio.optimization.loops.motion_depth import NEIGHBOURS, PlaceMotion
-from graphvio.optimization.loops.verification import FreshView, View, crossings, verified
+from graphvio.optimization.loops.verification import FreshView, PlaceView, crossings, verified
 from graphvio.rig import Rig
 from graphvio.slam.interface import SlamFrontEnd
 from graphvio.trajectory import Trajectory
@@ -258,9 +258,9 @@ class Mapper:
         """
         return np.asarray(self._body_T_camera[place] @ se3_inverse(_body_T_camera(self._store.rig)))
 
-    def _neighbours(self, number: int) -> list[tuple[View, PlaceMotion]]:
+    def _neighbours(self, number: int) -> list[tuple[PlaceView, PlaceMotion]]:
         """Return the places next to a place in its chain, and the motions to them."""
-        found: list[tuple[View, PlaceMotion]] = []
+        found: list[tuple[PlaceView, PlaceMotion]] = []
         chains = self._graph.chains
         for other in (number + step for step in NEIGHBOURS):
             if 0 <= other < len(chains) and chains.fragment(other) == chains.fragment(number):

@@ -23,7 +23,7 @@ _READ_NOISE = 0.7  # grey levels at gain 1
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class RenderedView:
     """One rendered view, without noise.
 
     Attributes:
@@ -57,7 +57,7 @@ class CameraRays:
         self.slopes = slopes.reshape(height, width, 2, 2)
         self.tile_boxes = _tile_boxes(self.rays, self.slopes, TILE_PX if camera.line_time_us == 0.0 else 1)
 
-    def render(self, surfaces: Surfaces, atlas: Atlas, world_T_cam: Float) -> View:
+    def render(self, surfaces: Surfaces, atlas: Atlas, world_T_cam: Float) -> RenderedView:
         """Render the surfaces as seen from ``world_T_cam`` (4, 4), or (H, 4, 4) at each line of a rolling shutter."""
         poses = world_T_cam.reshape(-1, 4, 4)
         coefficients = np.array([ray_coefficients(surfaces.corners, se3_inverse(pose)) for pose in poses])
@@ -77,7 +77,7 @@ class CameraRays:
         radiance[~self._has_ray], hit[~self._has_ray], inverse_depth[~self._has_ray] = 0.0, -1, 0.0
         with np.errstate(divide="ignore"):
             depth = 1.0 / inverse_depth
-        return View(radiance, depth, surfaces.is_moving[hit] & (hit >= 0))
+        return RenderedView(radiance, depth, surfaces.is_moving[hit] & (hit >= 0))
 
 
 @kernel

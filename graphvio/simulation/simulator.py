@@ -14,7 +14,7 @@ from graphvio.rig import Imu, Rig
 from graphvio.simulation.calibration_error import ImuError
 from graphvio.simulation.imu import ImuTrack, measure
 from graphvio.simulation.named_rigs import NAMED_RIGS
-from graphvio.simulation.renderer import CameraRays, Film, View
+from graphvio.simulation.renderer import CameraRays, Film, RenderedView
 from graphvio.simulation.rig_change import RigChange
 from graphvio.simulation.scenes import build_scene
 from graphvio.simulation.surfaces import Stage, Surfaces
@@ -126,7 +126,7 @@ class Simulator:
         """Return the surfaces of the world at the time of a frameset."""
         return self._stage.at(float(self._seconds(self.stamps_ns[index])))
 
-    def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> View:
+    def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> RenderedView:
         """Render the noise-free radiance and true depth of an image.
 
         Each line of a rolling shutter is seen from where the camera is at that line's instant. What moves in the world

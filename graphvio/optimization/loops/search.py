@@ -18,7 +18,7 @@ from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.motion_depth import NEIGHBOURS, PlaceMotion, place_motion
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.retrieval import candidates, describe, vocabulary
-from graphvio.optimization.loops.verification import StoredView, View, crossings, verified
+from graphvio.optimization.loops.verification import PlaceView, StoredView, crossings, verified
 from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Rig
 from graphvio.sources import Source
@@ -144,11 +144,11 @@ class _Verifier:
             if not self._database.has_matches(first, second):
                 self._database.add_matches(first, second, rows, geometry)
 
-    def _neighbours(self, number: int) -> list[tuple[View, PlaceMotion]]:
+    def _neighbours(self, number: int) -> list[tuple[PlaceView, PlaceMotion]]:
         """Return the places next to a place in its session, and the motions to them where they are known."""
         place = self._places[number]
         record = self._sessions[place.session].record
-        found: list[tuple[View, PlaceMotion]] = []
+        found: list[tuple[PlaceView, PlaceMotion]] = []
         for step in NEIGHBOURS if record is not None else ():
             if not 0 <= number + step < len(self._places) or self._places[number + step].session != place.session:
                 continue

@@ -27,7 +27,7 @@ _MIN_MATCHES = 20
 _MAX_CROSSINGS = 2  # pairs of images of a candidate that are matched
 
 
-class View(Protocol):
+class PlaceView(Protocol):
     """A place whose features may be in memory or in a database; j is an index in the rig's groups."""
 
     @property
@@ -47,7 +47,7 @@ class View(Protocol):
         """Return the place's images, as far as they still exist."""
 
 
-Neighbours = Callable[[], Sequence[tuple[View, PlaceMotion]]]
+Neighbours = Callable[[], Sequence[tuple[PlaceView, PlaceMotion]]]
 """Returns the places of the same rig next to a place, and the motions from it to them."""
 
 
@@ -67,17 +67,17 @@ class StoredView:
         return image_name(self.session, self.rig.groups[j].left.name, self.stamp_ns)
 
     def sees(self, j: int) -> bool:
-        """See `View`."""
+        """See `PlaceView`."""
         return self.name(j) in self.database.names
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """See `View`."""
+        """See `PlaceView`."""
         name = self.name(j)
         with self.lock:
             return self.database.pixels(name), self.database.descriptors(name)
 
     def frame(self, j: int) -> PairFrame:
-        """See `View`."""
+        """See `PlaceView`."""
         group, left = self.rig.groups[j], self.name(j)
         if isinstance(group, SingleCamera):
             return undetermined(group.left, self.stamp_ns, self.features(j)[0])
@@ -88,7 +88,7 @@ class StoredView:
         return frame_of(group, self.stamp_ns, pixels, in_right, rows)
 
     def frameset(self) -> FrameSet:
-        """See `View`."""
+        """See `PlaceView`."""
         return self.frameset_at(self.stamp_ns)
 
 
@@ -101,20 +101,20 @@ class FreshView:
     seen: Mapping[int, PairFeatures]  # by the index in the rig's groups
 
     def sees(self, j: int) -> bool:
-        """See `View`."""
+        """See `PlaceView`."""
         return j in self.seen
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """See `View`."""
+        """See `PlaceView`."""
         return self.seen[j].left, self.seen[j].descriptors
 
     def frame(self, j: int) -> PairFrame:
-        """See `View`."""
+        """See `PlaceView`."""
         seen = self.seen[j]
         return frame_of(self.rig.groups[j], self.images.stamp_ns, seen.left, seen.right, seen.rows)
 
     def frameset(self) -> FrameSet:
-        """See `View`."""
+        """See `PlaceView`."""
         return self.images
 
 
@@ -128,7 +128,7 @@ def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: An
 
 
 def verified(
-    earlier: View, later: View, tried: Sequence[tuple[int, int]], observers: Sequence[PairObserver] | None,
+    earlier: PlaceView, later: PlaceView, tried: Sequence[tuple[int, int]], observers: Sequence[PairObserver] | None,
     config: Config, seed: Sequence[int], neighbours: Neighbours,
     on_matched: Callable[[int, int, Int, Any], None] | None = None,
 ) -> Resection | None:  # fmt: skip
@@ -170,7 +170,7 @@ def verified(
     return found
 
 
-def _matched(earlier: View, later: View, a: int, b: int) -> tuple[Int, Any]:
+def _matched(earlier: PlaceView, later: PlaceView, a: int, b: int) -> tuple[Int, Any]:
     """Return matches (M, 2) by descriptors, and COLMAP's two-view geometry, or None if they are few."""
     (first, first_descriptors), (second, second_descriptors) = earlier.features(a), later.features(b)
     rows = alike(first_descriptors, second_descriptors)
@@ -180,7 +180,7 @@ def _matched(earlier: View, later: View, a: int, b: int) -> tuple[Int, Any]:
     return rows, estimated_geometry(cameras, (first, second), rows)
 
 
-def _with_depth(view: View, j: int, neighbours: Neighbours) -> Located:
+def _with_depth(view: PlaceView, j: int, neighbours: Neighbours) -> Located:
     """Return a place's features with their depth, those of a single camera by motion."""
     frame, group = view.frame(j), view.rig.groups[j]
     if not isinstance(group, SingleCamera):
