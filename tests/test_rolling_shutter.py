@@ -139,7 +139,7 @@ def test_lines_are_rendered_from_where_the_camera_is_then() -> None:
     for line in (0, 100, 239):
         seconds = 3.0 + 1e-6 * camera.line_time_us * line
         rays = still._rays_of(0)[0]
-        then = rays.render(surfaces, still._stage.atlas, at(np.array([seconds])).world_T_body[0] @ camera.body_T_cam)
+        then = rays.render(surfaces, still._prepared.atlas, at(np.array([seconds])).world_T_body[0] @ camera.body_T_cam)
         np.testing.assert_allclose(view.depth[line], then.depth[line], rtol=1e-9)
         inner = np.abs(np.diff(then.depth[line], prepend=0.0)) < 0.01  # borders are averaged with lines beside
         assert np.median(np.abs(view.radiance[line] - then.radiance[line])[inner]) < 1e-6

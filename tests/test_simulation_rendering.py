@@ -9,7 +9,7 @@ from graphvio.rig import Camera
 from graphvio.simulation import Simulator, make_simulator
 from graphvio.simulation.default_rig import default_rig, paper_left2_T_left1
 from graphvio.simulation.renderer import CameraRays
-from graphvio.simulation.surfaces import Stage
+from graphvio.simulation.surfaces import PreparedWorld
 from graphvio.simulation.textures import checkerboard, pack
 from graphvio.simulation.world import Exposure, Rectangle, World
 
@@ -40,7 +40,7 @@ def test_render_corners_match_projection(camera: int, tilt: tuple[float, float, 
     rotation = cv2.Rodrigues(np.array(tilt))[0]
     cam_T_board = se3(np.ascontiguousarray(rotation, dtype=np.float64), np.array([0.1, -0.05, 1.3]))
     atlas = pack({"board": (checkerboard(SQUARES), 1.0)})
-    surfaces = Stage(board_world(world_T_cam @ cam_T_board), atlas).at(0.0)
+    surfaces = PreparedWorld(board_world(world_T_cam @ cam_T_board), atlas).at(0.0)
     radiance = rays.render(surfaces, atlas, world_T_cam).radiance
     # The locator works on gradients: without blur it errs by 0.1 px even on exactly integrated pixels.
     image = cv2.GaussianBlur(radiance * np.float32(200.0), (0, 0), 1.2)
@@ -159,7 +159,7 @@ def test_pixels_without_a_ray_are_black(room: Simulator) -> None:
     fisheye = Camera("cam0", "equidistant", (160, 160), np.array([48.0, 48.0, 80.0, 80.0]), np.zeros(4), np.eye(4))
     x, y = np.meshgrid(np.arange(160), np.arange(160))
     is_beyond = np.hypot(x - 80.0, y - 80.0) / 48.0 > np.deg2rad(80.0)
-    view = CameraRays(fisheye).render(room.surfaces(0), room._stage.atlas, room.world_T_body[0])
+    view = CameraRays(fisheye).render(room.surfaces(0), room._prepared.atlas, room.world_T_body[0])
     assert (view.radiance[is_beyond] == 0.0).all()
     assert np.isinf(view.depth[is_beyond]).all()
     assert (view.radiance[~is_beyond] > 0.0).mean() > 0.95

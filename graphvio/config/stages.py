@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from graphvio.config.values import Stage
+from graphvio.config.values import StageConfig
 
 
 @dataclass(frozen=True)
-class CornerConfig(Stage):
+class CornerConfig(StageConfig):
     """Harris corners, one in each cell of the left image that has no track (section 3)."""
 
     cells_across: int = 18
@@ -31,7 +31,7 @@ class CornerConfig(Stage):
 
 
 @dataclass(frozen=True)
-class TrackingConfig(Stage):
+class TrackingConfig(StageConfig):
     """Temporal 2D-2D matching by Lucas-Kanade (section 3).
 
     Each track is registered on the keyframe's patch at its predicted place, and followed through pyramids from the
@@ -49,7 +49,7 @@ class TrackingConfig(Stage):
 
 
 @dataclass(frozen=True)
-class StereoConfig(Stage):
+class StereoConfig(StageConfig):
     """Left-right matching under the epipolar and disparity constraints, and triangulation (section 3)."""
 
     min_depth_m: float = 0.3
@@ -62,7 +62,7 @@ class StereoConfig(Stage):
 
 
 @dataclass(frozen=True)
-class MotionConfig(Stage):
+class MotionConfig(StageConfig):
     """Robust resection and refinement, and the choice between pairs (section 3, 3.1)."""
 
     selection: Literal["best_pair", "joint"] = "joint"
@@ -107,7 +107,7 @@ class MotionConfig(Stage):
 
 
 @dataclass(frozen=True)
-class CalibrationConfig(Stage):
+class CalibrationConfig(StageConfig):
     """Estimation of the rig's calibration while it runs."""
 
     online: bool = True
@@ -116,7 +116,7 @@ class CalibrationConfig(Stage):
 
 
 @dataclass(frozen=True)
-class InitialisationConfig(Stage):
+class InitialisationConfig(StageConfig):
     """The first pose: tilt from the accelerometer, while stationary or in motion."""
 
     window_s: float = 1.0
@@ -137,7 +137,7 @@ class InitialisationConfig(Stage):
 
 
 @dataclass(frozen=True)
-class SmootherConfig(Stage):
+class SmootherConfig(StageConfig):
     """The fixed-lag window, its gate and its limits (section 5)."""
 
     lag_s: float = 0.75
@@ -169,7 +169,7 @@ class SmootherConfig(Stage):
 
 
 @dataclass(frozen=True)
-class FusionConfig(Stage):
+class FusionConfig(StageConfig):
     """Choice of the back-end, which fuses motions and the IMU."""
 
     estimator: Literal["smoother", "filter"] = "smoother"
@@ -181,7 +181,7 @@ class FusionConfig(Stage):
 
 
 @dataclass(frozen=True)
-class FilterConfig(Stage):
+class FilterConfig(StageConfig):
     """The paper's extended Kalman filter (section 5), where ``fusion.estimator`` is ``filter``."""
 
     accel_sigma_m_s2: float = 5.0
@@ -212,7 +212,7 @@ class FilterConfig(Stage):
 
 
 @dataclass(frozen=True)
-class TimingConfig(Stage):
+class TimingConfig(StageConfig):
     """Times to wait, and gaps that are tolerated."""
 
     simultaneous_ms: float | None = None
@@ -231,7 +231,7 @@ class TimingConfig(Stage):
 
 
 @dataclass(frozen=True)
-class OptimizationConfig(Stage):
+class OptimizationConfig(StageConfig):
     """Optimisation of whole sessions: states, places and loop closures."""
 
     keyframe_interval_s: float = 0.2
@@ -254,7 +254,7 @@ class OptimizationConfig(Stage):
 
 
 @dataclass(frozen=True)
-class KeyframesConfig(Stage):
+class KeyframesConfig(StageConfig):
     """Keyframes for a SLAM system, and the gate of its corrections; unused without one."""
 
     descriptors: Literal["orb", "sift", "none"] = "orb"
@@ -266,7 +266,7 @@ class KeyframesConfig(Stage):
 
 
 @dataclass(frozen=True)
-class LiveConfig(Stage):
+class LiveConfig(StageConfig):
     """Real-time operation on live sensors."""
 
     max_latency_ms: float = 100.0

@@ -21,7 +21,7 @@ _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
-class Stage:
+class StageConfig:
     """A part of the configuration: a frozen dataclass whose values are checked whenever it is constructed."""
 
     def __post_init__(self) -> None:

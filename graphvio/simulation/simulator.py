@@ -17,7 +17,7 @@ from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.simulation.renderer import CameraRays, Film, RenderedView
 from graphvio.simulation.rig_change import RigChange
 from graphvio.simulation.scenes import build_scene
-from graphvio.simulation.surfaces import Stage, Surfaces
+from graphvio.simulation.surfaces import PreparedWorld, Surfaces
 from graphvio.simulation.textures import Atlas, standard_atlas
 from graphvio.simulation.world import Scene
 
@@ -76,7 +76,7 @@ class Simulator:
         groups = len(self.rig.groups)
         self.rates_hz = tuple((rates + [rates[-1]] * groups)[:groups])
         self._trigger_offset_ms = trigger_offset_ms
-        self._stage = Stage(scene.world, atlas if atlas is not None else standard_atlas())
+        self._prepared = PreparedWorld(scene.world, atlas if atlas is not None else standard_atlas())
         self._imu_error, self._rig_change = imu_error, rig_change
         self._rays_in = lru_cache(_KEPT_STAGES)(self._rays_of)
         self.films = [Film(rays, _SENSITIVITIES[i % 4]) for i, rays in enumerate(self._rays_in(0))]
@@ -124,7 +124,7 @@ class Simulator:
 
     def surfaces(self, index: int) -> Surfaces:
         """Return the surfaces of the world at the time of a frameset."""
-        return self._stage.at(float(self._seconds(self.stamps_ns[index])))
+        return self._prepared.at(float(self._seconds(self.stamps_ns[index])))
 
     def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> RenderedView:
         """Render the noise-free radiance and true depth of an image.
@@ -144,7 +144,7 @@ class Simulator:
             line_times_s = 1e-6 * rays.camera.line_time_us * np.arange(rays.camera.size_px[1])
             times_s = float(self._seconds(self.stamps_ns[index])) + line_times_s
             world_T_body = self.scene.motion.at(np.minimum(times_s, self.scene.motion.duration_s)).world_T_body
-        return rays.render(seen, self._stage.atlas, world_T_body @ rays.camera.body_T_cam)
+        return rays.render(seen, self._prepared.atlas, world_T_body @ rays.camera.body_T_cam)
 
     def image(self, index: int, camera: int, noisy: bool = True, surfaces: Surfaces | None = None) -> Image:
         """Render a grey image (H, W); see `view` for the arguments."""

@@ -33,7 +33,7 @@ class Surfaces:
     is_moving: Bool
 
 
-class Stage:
+class PreparedWorld:
     """A world prepared once, from which the surfaces at any time are computed."""
 
     def __init__(self, world: World, atlas: Atlas) -> None:
