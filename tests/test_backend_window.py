@@ -6,7 +6,7 @@ import pytest
 from synthetic import random_covariance, transform
 
 from graphvio.arrays import Float
-from graphvio.backend.window import Window, WindowError
+from graphvio.backend.window import GraphWindow, WindowError
 
 
 def x(k: int) -> int:
@@ -17,7 +17,7 @@ def noise(covariance: Float) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
-def add_point(windows: list[Window], k: int, rng: np.random.Generator, spread: float = 1.0) -> None:
+def add_point(windows: list[GraphWindow], k: int, rng: np.random.Generator, spread: float = 1.0) -> None:
     """A state of three numbers, tied to the one before and the one before that, to all windows alike."""
     for window in windows:
         window.values.insert(x(k), np.zeros(3))
@@ -40,7 +40,7 @@ def add_point(windows: list[Window], k: int, rng: np.random.Generator, spread: f
 
 def test_marginalisation_of_a_linear_problem_is_exact() -> None:
     rng = np.random.default_rng(0)
-    short, whole = Window(), Window()
+    short, whole = GraphWindow(), GraphWindow()
     for k in range(12):
         add_point([short, whole], k, rng)
         for window in (short, whole):
@@ -55,7 +55,7 @@ def test_marginalisation_of_a_linear_problem_is_exact() -> None:
 
 def test_marginalising_several_at_once_is_the_same_as_one_by_one() -> None:
     rng = np.random.default_rng(1)
-    together, apart = Window(), Window()
+    together, apart = GraphWindow(), GraphWindow()
     for k in range(6):
         add_point([together, apart], k, rng)
     together.marginalise([x(1), x(0), x(3)])
@@ -70,7 +70,7 @@ def test_marginalising_several_at_once_is_the_same_as_one_by_one() -> None:
 
 def test_marginalisation_of_poses_with_small_errors() -> None:
     rng = np.random.default_rng(2)
-    short, whole = Window(), Window()
+    short, whole = GraphWindow(), GraphWindow()
     step, previous = transform([0.02, 0.01, -0.03], [0.1, 0.0, 0.02]), np.eye(4)
     for k in range(8):
         previous = previous @ step
@@ -95,7 +95,7 @@ def test_marginalisation_of_poses_with_small_errors() -> None:
 
 def test_joint_covariance_is_in_the_order_asked_for() -> None:
     rng = np.random.default_rng(3)
-    window = Window()
+    window = GraphWindow()
     for k in range(3):
         add_point([window], k, rng)
     window.optimize()
@@ -107,7 +107,7 @@ def test_joint_covariance_is_in_the_order_asked_for() -> None:
 
 
 def test_optimise_converges_from_afar() -> None:
-    window = Window()
+    window = GraphWindow()
     truth = [transform([0.1 * k, 0.2 * k, -0.1 * k], [k, 0.5 * k, 0.0]) for k in range(5)]
     for k, pose in enumerate(truth):
         window.values.insert(x(k), gtsam.Pose3(pose @ transform([0.2, -0.1, 0.1], [0.3, -0.2, 0.1])))
@@ -121,9 +121,9 @@ def test_optimise_converges_from_afar() -> None:
         np.testing.assert_allclose(window.values.atPose3(x(k)).matrix(), pose, atol=1e-8)
 
 
-def loose_window() -> Window:
+def loose_window() -> GraphWindow:
     """Two states, of which nothing says where they are."""
-    window = Window()
+    window = GraphWindow()
     for k in range(2):
         window.values.insert(x(k), np.zeros(3))
     window.add(gtsam.BetweenFactorVector(x(0), x(1), np.ones(3), noise(np.eye(3))))
@@ -144,8 +144,8 @@ def test_what_is_not_constrained_has_no_solution_and_no_covariance() -> None:
     [lambda w: w.optimize(), lambda w: w.joint_covariance([x(5)]), lambda w: w.marginalise([x(5)])],
     ids=["optimise", "joint_covariance", "marginalise"],
 )
-def test_a_variable_without_any_factor_is_not_constrained(use: Callable[[Window], object]) -> None:
-    window = Window()
+def test_a_variable_without_any_factor_is_not_constrained(use: Callable[[GraphWindow], object]) -> None:
+    window = GraphWindow()
     add_point([window], 0, np.random.default_rng(4))
     window.values.insert(x(5), np.zeros(3))
     with pytest.raises(WindowError):
@@ -179,7 +179,7 @@ def test_a_failed_solution_leaves_the_values() -> None:
 
 def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
-    followed, plain = Window(), Window()
+    followed, plain = GraphWindow(), GraphWindow()
     for k in range(6):
         add_point([followed, plain], k, rng)
     for window, last in ((followed, [x(4), x(5)]), (plain, [])):
@@ -187,7 +187,7 @@ def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pyt
         add_point([window], 6, np.random.default_rng(5))
     expected = plain.joint_covariance([x(4), x(6)])
     with monkeypatch.context() as patched:
-        patched.delattr(Window, "_solve")
+        patched.delattr(GraphWindow, "_solve")
         np.testing.assert_allclose(followed.joint_covariance([x(4), x(6)]), expected, atol=1e-12)
     # A factor that ties in what is not followed needs the whole window.
     for window in (followed, plain):
@@ -198,7 +198,7 @@ def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pyt
 
 def test_advancing_is_the_whole_solution_for_what_is_followed() -> None:
     rng = np.random.default_rng(6)
-    quick, whole = Window(), Window()
+    quick, whole = GraphWindow(), GraphWindow()
     for k in range(10):
         add_point([quick, whole], k, rng, spread=1e-3)
         whole.optimize()
@@ -220,7 +220,7 @@ def test_advancing_is_the_whole_solution_for_what_is_followed() -> None:
 def test_advancing_counts_what_a_covariance_was_asked_with() -> None:
     """Factors that the marginal already knows of, since a gate asked for it, still correct the values."""
     rng = np.random.default_rng(7)
-    asked, whole = Window(), Window()
+    asked, whole = GraphWindow(), GraphWindow()
     for k in range(4):
         add_point([asked, whole], k, rng, spread=1e-3)
     asked.optimize([x(2), x(3)])
@@ -234,7 +234,7 @@ def test_advancing_counts_what_a_covariance_was_asked_with() -> None:
 @pytest.mark.parametrize("reason", ["new window", "not followed", "long step", "robust kernel", "unconstrained"])
 def test_where_advancing_is_impossible_nothing_changes(reason: str) -> None:
     rng = np.random.default_rng(8)
-    window = Window(min_iterations=2 if reason == "robust kernel" else 1)
+    window = GraphWindow(min_iterations=2 if reason == "robust kernel" else 1)
     for k in range(5):
         add_point([window], k, rng)
     if reason != "new window":
@@ -255,7 +255,7 @@ def test_where_advancing_is_impossible_nothing_changes(reason: str) -> None:
 @pytest.mark.parametrize("walk", [1e-2, 1e-5, 1e-8, 1e-10])
 def test_values_that_hardly_change_lose_no_digits(walk: float) -> None:
     """As biases of good sensors: the information of a step may exceed all that is known of the value itself."""
-    window, unit = Window(), np.eye(3)
+    window, unit = GraphWindow(), np.eye(3)
     for k in range(10):
         window.values.insert(x(k), np.zeros(3))
         window.add(
@@ -278,7 +278,7 @@ def test_optimize_shortens_a_step_that_makes_it_worse() -> None:
             jacobians[0] = np.array([[1.0 / (1.0 + at[0] ** 2)]])
         return np.arctan(at)
 
-    window = Window()
+    window = GraphWindow()
     window.values.insert(0, np.array([3.0]))
     window.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, 0.1), [0], error))
     errors = []

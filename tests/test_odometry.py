@@ -24,7 +24,7 @@ from graphvio import (
 )
 from graphvio.arrays import Image
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.window import Window, WindowError
+from graphvio.backend.window import GraphWindow, WindowError
 from graphvio.geometry import so3_log
 from graphvio.measurements.motion import Quality
 from graphvio.measurements.sensors import Measurement
@@ -412,13 +412,13 @@ def test_two_wild_imu_samples_leave_an_error_that_the_covariance_admits(
 @pytest.mark.parametrize(
     ("owner", "method", "kind"),
     [
-        (Window, "optimize", WindowError),
-        (Window, "optimize", RuntimeError),
-        (Window, "optimize", np.linalg.LinAlgError),
-        (Window, "advance", WindowError),
-        (Window, "joint_covariance", RuntimeError),
-        (Window, "marginalise", np.linalg.LinAlgError),
-        (Window, "add", RuntimeError),
+        (GraphWindow, "optimize", WindowError),
+        (GraphWindow, "optimize", RuntimeError),
+        (GraphWindow, "optimize", np.linalg.LinAlgError),
+        (GraphWindow, "advance", WindowError),
+        (GraphWindow, "joint_covariance", RuntimeError),
+        (GraphWindow, "marginalise", np.linalg.LinAlgError),
+        (GraphWindow, "add", RuntimeError),
         (Smoother, "extend", RuntimeError),
         (Smoother, "gate", np.linalg.LinAlgError),
         (Smoother, "state_covariance", RuntimeError),

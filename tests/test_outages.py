@@ -11,7 +11,7 @@ import pytest
 
 from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.arrays import Float
-from graphvio.backend.window import Window, WindowError
+from graphvio.backend.window import GraphWindow, WindowError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
@@ -196,17 +196,18 @@ def test_a_window_that_fails_while_lost_glues_nothing(
 ) -> None:
     """In the dark and at the first images after it: lost stays lost, and what follows is another epoch."""
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
-    optimise, start_ns = Window.optimize, next(e.stamp_ns for e in measurements if isinstance(e, FrameSet))
+    optimise, start_ns = GraphWindow.optimize, next(e.stamp_ns for e in measurements if isinstance(e, FrameSet))
 
-    def fails_now_and_then(window: Window, followed: Sequence[int] = ()) -> None:
+    def fails_now_and_then(window: GraphWindow, followed: Sequence[int] = ()) -> None:
         if failing:
             failing.pop()
             raise WindowError("made to fail")
         optimise(window, followed)
 
     failing: list[int] = []
-    monkeypatch.setattr(Window, "optimize", fails_now_and_then)
-    monkeypatch.setattr(Window, "advance", lambda *_: False)  # or it depends on the solver which framesets optimise
+    monkeypatch.setattr(GraphWindow, "optimize", fails_now_and_then)
+    # Else it depends on the solver which framesets optimise.
+    monkeypatch.setattr(GraphWindow, "advance", lambda *_: False)
     odometry, estimates = Odometry(open_source(walk_folder).rig, config), []
     for measurement in altered(measurements, START_S, START_S + 3.0, blackened):
         if isinstance(measurement, FrameSet) and (measurement.stamp_ns - start_ns) // MS in (5500, 6000, 6050):

@@ -33,7 +33,7 @@ from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity, tilt_covariance
-from graphvio.backend.window import SOLVER_ERRORS, Window
+from graphvio.backend.window import SOLVER_ERRORS, GraphWindow
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.gate_result import GateResult
@@ -241,8 +241,8 @@ class Smoother:
         self._nav_covariance[3:, 3:] += nav_R_body @ forgotten @ nav_R_body.T
         self._window.add(factor)
 
-    def _new_window(self) -> Window:
-        return Window(min_iterations=1 if self._config.huber_probability == 1.0 else 2)
+    def _new_window(self) -> GraphWindow:
+        return GraphWindow(min_iterations=1 if self._config.huber_probability == 1.0 else 2)
 
     def _with_nav(self, covariance: Float) -> Float:
         """Add the covariance of nav to that of the newest pose (6, 6), in body."""

@@ -27,7 +27,7 @@ SOLVER_ERRORS = (WindowError, RuntimeError, np.linalg.LinAlgError)
 """Raised by a window, gtsam and numpy where equations have no solution."""
 
 
-class Window:
+class GraphWindow:
     """Nonlinear factors and the present values of their variables.
 
     Args:

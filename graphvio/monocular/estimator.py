@@ -28,7 +28,7 @@ from graphvio.monocular.initialiser import MAX_DURATION_NS, Initialiser, shared_
 from graphvio.monocular.overlap_trust import OverlapTrust, alone
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
-from graphvio.monocular.window import Window
+from graphvio.monocular.window import KeyframeWindow
 from graphvio.monocular.window_solver import FIRST_SIGMA_PX, Solution, WindowSolver, newest_state
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
@@ -64,7 +64,7 @@ class MonocularEstimator:
         self._has_imu = self._is_initialised = self._is_imu_doubted = False
         self._collect_keyframes()
         self._has_overlaps, self._are_trusted = False, True
-        self._window: Window | None = None
+        self._window: KeyframeWindow | None = None
         self._latest_ns = 0
         self._since_ns = 0  # of the initialisation
         self._is_reported = False
@@ -257,7 +257,7 @@ class MonocularEstimator:
             f"{(stamp_ns - self._since_ns) * 1e-9:.1f} s after the initialisation {why}",
         )
 
-    def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
+    def _begin(self, window: KeyframeWindow, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
         """Begin with a window whose scale is known."""
         self._window, self._is_keyframe, self._before = window, True, None
         self._solver.begin(window, stamp_ns)
@@ -269,7 +269,7 @@ class MonocularEstimator:
         )
         return self._solve(window, stamp_ns, is_keyframe, is_new=True)
 
-    def _without_overlaps(self, stamp_ns: int, window: Window | None) -> Window | None:
+    def _without_overlaps(self, stamp_ns: int, window: KeyframeWindow | None) -> KeyframeWindow | None:
         """Return a window without overlaps where these cannot be trusted: they are not used from then on.
 
         Once the calibration is estimated, the window itself finds out how the cameras are turned to each other.
@@ -288,7 +288,7 @@ class MonocularEstimator:
         )
         return instead
 
-    def _solve(self, window: Window, stamp_ns: int, is_keyframe: bool, is_new: bool = False) -> StateUpdate:
+    def _solve(self, window: KeyframeWindow, stamp_ns: int, is_keyframe: bool, is_new: bool = False) -> StateUpdate:
         if not is_new:
             window.add_views(self._camera_tracks, self._is_stationary)
         self._is_keyframe = is_keyframe

@@ -27,7 +27,7 @@ from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
 from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
 from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import located
-from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, Window
+from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
 
@@ -96,7 +96,9 @@ class Initialiser:
         """Stamp of the first keyframe, or None."""
         return self._keyframes[0].stamp_ns if self._keyframes else None
 
-    def add(self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool) -> Window | None:
+    def add(
+        self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool
+    ) -> KeyframeWindow | None:
         """Take a keyframe, and return the window if its scale is known."""
         if is_stationary and self._keyframes and self._keyframes[-1].is_stationary:
             self._keyframes.pop()  # of a standstill the newest keyframe stays
@@ -133,7 +135,7 @@ class Initialiser:
         self._calibration.forget()
         return self._calibration.candidates
 
-    def _solved(self, factors: Float) -> Window | None:
+    def _solved(self, factors: Float) -> KeyframeWindow | None:
         """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
         self._fits_no_motion = False
         file = self._calibration.file(factors)
@@ -180,7 +182,7 @@ class Initialiser:
             self.reason = "images and IMU contradict the rig file"
             return None
         still = [keyframe.is_stationary for keyframe in keyframes]
-        return self._in_nav(Window(states, views, still, names, landmarks, prior, factors))
+        return self._in_nav(KeyframeWindow(states, views, still, names, landmarks, prior, factors))
 
     def _covered_keyframes(self, file: Gaussian | None) -> tuple[list[_Keyframe], InertialSamples]:
         """Return the keyframes that the IMU covers whatever its time offset may be, and its samples."""
@@ -234,7 +236,7 @@ class Initialiser:
         of_accel = np.abs(states.biases[3:]) <= _MAX_SIGMAS * ACCEL_BIAS_SIGMA
         return bool(of_accel.all()) and self._calibration.is_plausible(states.calibration)
 
-    def _in_nav(self, window: Window) -> Window:
+    def _in_nav(self, window: KeyframeWindow) -> KeyframeWindow:
         """Turn a window level: its first pose has heading zero, and is the origin."""
         states = window.states
         body_T_odom = se3_inverse(states.poses[0])

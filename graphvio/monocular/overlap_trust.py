@@ -14,7 +14,7 @@ import numpy as np
 from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.initialiser import Initialiser
 from graphvio.monocular.states import States
-from graphvio.monocular.window import Window
+from graphvio.monocular.window import KeyframeWindow
 
 _MAX_SIGMAS = 4.0
 _MIN_OFF = 0.025  # seconds after the scale is known, the IMU alone was at most 2.3 % off
@@ -52,7 +52,7 @@ class OverlapTrust:
 
     def add(
         self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool, states: States | None
-    ) -> tuple[Window, str] | None:
+    ) -> tuple[KeyframeWindow, str] | None:
         """Take a keyframe.
 
         Args:

@@ -18,7 +18,7 @@ MAX_OFF = 0.3  # share of a landmark's views that may be farther off
 
 
 @dataclass(eq=False)
-class Window:
+class KeyframeWindow:
     """States of a window with what was seen from them.
 
     Attributes:

@@ -23,7 +23,7 @@ from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
 from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure
-from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, Window
+from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 
 FIRST_SIGMA_PX = 0.3
 _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.12, 0.6
@@ -98,12 +98,12 @@ class WindowSolver:
 
     # ------------------------------------------------------------------ one window
 
-    def begin(self, window: Window, stamp_ns: int) -> None:
+    def begin(self, window: KeyframeWindow, stamp_ns: int) -> None:
         """Take the window of an epoch's first pose, at a frameset."""
         self.first_pose_ns = stamp_ns
         self.calibration.begin(window.factors)
 
-    def solve(self, window: Window, stamp_ns: int, is_keyframe: bool) -> Solution:
+    def solve(self, window: KeyframeWindow, stamp_ns: int, is_keyframe: bool) -> Solution:
         """Solve for the states and landmarks, and leave out what does not stand still.
 
         Args:
@@ -133,7 +133,7 @@ class WindowSolver:
             self._finish_keyframe(window, adjusted)
         return Solution(adjusted.equations.imu_errors2, is_tracking, dropped)
 
-    def end(self, window: Window) -> None:
+    def end(self, window: KeyframeWindow) -> None:
         """Declare all poses of the window final, and hand its landmarks over."""
         if self._on_views is not None:
             while window.states.stamps_ns[0] < self.first_pose_ns:
@@ -150,17 +150,17 @@ class WindowSolver:
 
     # ------------------------------------------------------------------ parts of these steps
 
-    def _structure(self, window: Window) -> tuple[Structure, Float, Int]:
+    def _structure(self, window: KeyframeWindow) -> tuple[Structure, Float, Int]:
         """Return the window's landmarks, where they are (L, 3), and their identities (L,)."""
         states = window.states
         return window.landmarks.structure(window.views, states.poses, states.cameras(self._cameras))
 
-    def _measured(self, window: Window, structure: Structure) -> Measurements:
+    def _measured(self, window: KeyframeWindow, structure: Structure) -> Measurements:
         samples = self.samples.between(window.states.stamps_ns, self.calibration.is_file_exact)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
 
     def _leave_out_moving(
-        self, window: Window, structure: Structure, ids: Int, errors2: Float
+        self, window: KeyframeWindow, structure: Structure, ids: Int, errors2: Float
     ) -> tuple[bool, Mapping[int, Int]]:
         """End landmarks that do not stand still: whether enough others are seen, and which tracks these were."""
         off = far_off(structure, errors2, MAX_ERROR2, MAX_OFF)
@@ -173,7 +173,7 @@ class WindowSolver:
             _leave_out_mismatches(window, structure, ids, errors2)
         return is_tracking, dropped
 
-    def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
+    def _finish_keyframe(self, window: KeyframeWindow, adjusted: Adjusted) -> None:
         """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
         window.names.note_keyframe()
         if len(adjusted.equations.errors2):
@@ -183,7 +183,7 @@ class WindowSolver:
         while len(window.states.poses) > MAX_KEYFRAMES:
             self._forget_first(window)
 
-    def _forget_first(self, window: Window) -> None:
+    def _forget_first(self, window: KeyframeWindow) -> None:
         """Marginalise the oldest state and the landmarks that it sees."""
         states = window.states
         structure, places, ids = self._structure(window)
@@ -234,7 +234,7 @@ def _newest_covariance(adjusted: Adjusted) -> StateCovariance:
     )
 
 
-def _leave_out_mismatches(window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
+def _leave_out_mismatches(window: KeyframeWindow, structure: Structure, ids: Int, errors2: Float) -> None:
     """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
     rows = np.flatnonzero((structure.state == len(window.views) - 1) & (errors2 > MAX_ERROR2))
     if not len(rows):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import gtsam
 
 from graphvio.backend import smoother
-from graphvio.backend.window import Window
+from graphvio.backend.window import GraphWindow
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
@@ -102,7 +102,7 @@ class FactorLog:
 
     def __init__(self) -> None:
         self._added = Added(gtsam.NonlinearFactorGraph(), gtsam.Values())
-        smoother.Window = partial(_LoggedWindow, self)  # type: ignore[assignment, attr-defined]
+        smoother.GraphWindow = partial(_LoggedWindow, self)  # type: ignore[assignment, attr-defined]
 
     def take(self) -> Added:
         """Return what was inserted since the last call."""
@@ -122,7 +122,7 @@ class FactorLog:
                 self._added.values.insert(key, values.atPose3(key))
 
 
-class _LoggedWindow(Window):
+class _LoggedWindow(GraphWindow):
     def __init__(self, log: FactorLog, min_iterations: int = 1) -> None:
         super().__init__(min_iterations)
         self._log = log
