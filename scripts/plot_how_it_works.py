@@ -74,7 +74,8 @@ def stages() -> Any:
     )  # fmt: skip
     box(
         axes, (4.1, 0.75, 2.2, 1.6), PURPLE, "self-calibration",
-        "adjusts windows of keyframes\nin a thread of its own:\nlenses, left to right,\nplaces of the pairs, IMU",
+        "adjusts windows of keyframes\nin a thread of its own:\n"
+        "intrinsics, stereo extrinsics,\nbody_T_cam of the pairs, IMU",
     )  # fmt: skip
     box(
         axes, (6.9, 0.15, 2.6, 1.7), GREY, "estimate",
