@@ -56,7 +56,7 @@ def tracks() -> PairFrame:
         covariances=np.zeros((n, 3, 3)),
         slopes=np.tile(BASELINE_M * WALL[:2], (n, 1)),
         has_depth=np.ones(n, dtype=bool),
-        flat_for=np.zeros(n, dtype=np.int64),
+        frames_without_depth=np.zeros(n, dtype=np.int64),
     )
 
 

@@ -32,7 +32,7 @@ def frame(stamp_ns: int, inverse_depths: Float, first_id: int = 0) -> PairFrame:
         covariances=covariances,
         slopes=np.zeros((n, 2)),
         has_depth=np.ones(n, dtype=bool),
-        flat_for=np.zeros(n, dtype=np.int64),
+        frames_without_depth=np.zeros(n, dtype=np.int64),
     )
 
 

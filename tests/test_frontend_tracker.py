@@ -135,7 +135,7 @@ def test_keyframe_patches_prevent_drift() -> None:
 def test_observe_counts_every_rejection() -> None:
     frames = followed(walk(8), with_keyframe=True)
     for before, after in pairwise(frames):
-        entered = int((before.flat_for <= 3).sum())
+        entered = int((before.frames_without_depth <= 3).sum())
         kept = int((after.ages > 0).sum())
         assert entered - kept == sum(after.rejected[name] for name in FOLLOWED)
         assert int((~after.has_depth).sum()) == sum(after.rejected[name] for name in MATCHED)

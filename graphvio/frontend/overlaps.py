@@ -186,7 +186,7 @@ class Overlaps:
         new = PairFrame(
             found.stamp_ns, found.ids, found.ages, found.pixels, found.left, matches.right[good],
             matches.right_pixels[good], matches.points[good], matches.covariances[good], matches.slopes[good],
-            np.ones(len(rows), dtype=bool), found.flat_for,
+            np.ones(len(rows), dtype=bool), found.frames_without_depth,
         )  # fmt: skip
         partner.found = before.extended(new) if before.stamp_ns == frame.stamp_ns and len(before.ids) else new
 

@@ -26,7 +26,7 @@ from graphvio.timing import Stopwatch
 _MIN_FOUND = 0.7  # share of the tracks, below which the others are looked for where these foretell them
 _MAX_ROUNDS = 3
 _MAX_TRACKS_PER_CELL = 2
-_MAX_FLAT_FRAMES = 3  # then the track is dropped for another corner of its cell
+_MAX_FRAMES_WITHOUT_DEPTH = 3  # then the track is dropped for another corner of its cell
 _LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks that fail are tried again with all
 
 
@@ -108,7 +108,7 @@ class PairTracker:
             pixels[stays],
             inverse_depths[stays],
             last.slopes,
-            last.flat_for,
+            last.frames_without_depth,
             rejected,
         )
         watch.lap("stereo")
@@ -210,7 +210,7 @@ class PairTracker:
 
         The last of what is returned is whether each will still be in the image (N,).
         """
-        last, camera = self._last.keep(self._last.flat_for <= _MAX_FLAT_FRAMES), self._pair.left
+        last, camera = self._last.keep(self._last.frames_without_depth <= _MAX_FRAMES_WITHOUT_DEPTH), self._pair.left
         if left_T_left_prev is None:
             depths = np.where(last.has_depth, last.points[:, 2], np.nan)
             return last, last.pixels, depths, np.ones(len(last.ids), dtype=bool)
@@ -305,8 +305,8 @@ class PairTracker:
         return passes(found, alone, "crowded", rejected)
 
     def _matched(
-        self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float, flat_for: Int,
-        rejected: dict[str, int],
+        self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float,
+        frames_without_depth: Int, rejected: dict[str, int],
     ) -> PairFrame:  # fmt: skip
         """Match tracks of the newest left image to the right one, and triangulate them."""
         rays, has_ray = self._pair.left.unproject(pixels)
@@ -327,7 +327,7 @@ class PairTracker:
             covariances=matches.covariances,
             slopes=matches.slopes,
             has_depth=has_depth,
-            flat_for=np.where(has_depth, 0, flat_for + 1),
+            frames_without_depth=np.where(has_depth, 0, frames_without_depth + 1),
             rejected=rejected | matches.rejected,
         ).keep(has_ray)
         return frame if self._motion is None else as_at_stamp(frame, self._pair, self._motion)
@@ -379,7 +379,7 @@ def _unmatched(
         covariances=np.tile(np.eye(3), (n, 1, 1)),
         slopes=nothing,
         has_depth=np.ones(n, dtype=bool),
-        flat_for=unmoved,
+        frames_without_depth=unmoved,
         is_single=True,
         rejected=rejected,
     )

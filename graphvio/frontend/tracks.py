@@ -33,7 +33,7 @@ class PairFrame:
         slopes: (N, 2) derivative of the disparity by the left pixel (u, v) over the patch, as the slant of the surface
             makes it, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
         has_depth: (N,) whether the stereo match passed all its tests.
-        flat_for: (N,) number of frames since the last valid stereo match, 0 where this one has it.
+        frames_without_depth: (N,) number of frames since the last valid stereo match, 0 where this one has it.
         is_single: whether the camera has no partner: every track has a depth, though it may be next to unknown.
         rejected: test of tracking or stereo matching -> number of tracks that failed it.
         stage_ms: time by stage.
@@ -53,7 +53,7 @@ class PairFrame:
     covariances: Float
     slopes: Float
     has_depth: Bool
-    flat_for: Int
+    frames_without_depth: Int
     is_single: bool = False
     rejected: Mapping[str, int] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class PairFrame:
             covariances=np.zeros((0, 3, 3)),
             slopes=np.zeros((0, 2)),
             has_depth=none.astype(bool),
-            flat_for=whole,
+            frames_without_depth=whole,
         )
 
 

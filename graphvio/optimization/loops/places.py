@@ -96,7 +96,7 @@ class PairObserver(ImageObserver):
             covariances=matches.covariances,
             slopes=matches.slopes,
             has_depth=matches.good & has_ray,
-            flat_for=np.zeros(n, dtype=np.int64),
+            frames_without_depth=np.zeros(n, dtype=np.int64),
         )
 
     def _pyramid(self, image: Image) -> Pyramid:
