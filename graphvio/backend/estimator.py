@@ -173,7 +173,7 @@ class ImuFaultTolerant(Protocol):
     """
 
     def leave_imu_out(self) -> None:
-        """Stop using the IMU until `use_imu_again`; the initialisation no longer waits for what the IMU shows."""
+        """Take note that the IMU is not used until `use_imu_again`: the initialisation no longer waits for it."""
 
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
         """Use the IMU again: keep the newest pose, and take biases and gravity from a comparison with vision.
