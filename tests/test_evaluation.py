@@ -4,6 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evo.core import metrics, sync
+from evo.core.trajectory import PoseTrajectory3D
 from evo.core.units import Unit
 from evo.tools import file_interface
 
@@ -114,6 +115,32 @@ def test_drift_of_wrong_scale_is_error_at_end_by_path() -> None:
     assert figures.ate_rotation_deg.max < 1e-6  # although positions on a line leave the roll undefined
 
 
+def test_ate_with_scale_agrees_with_evo() -> None:
+    truth, estimate = walk(), walk(drift_m=0.01)
+    poses = estimate.nav_T_body.copy()
+    poses[:, :3, 3] *= 1.02
+    longer = Trajectory(estimate.stamps_ns, poses)
+    figures = evaluate(longer, truth)
+    theirs, reference = (
+        PoseTrajectory3D(poses_se3=list(each.nav_T_body), timestamps=1e-9 * each.stamps_ns) for each in (longer, truth)
+    )
+    _, _, scale = theirs.align(reference, correct_scale=True)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, theirs))
+    assert figures.ate_scaled_m == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
+    assert figures.scale_error_percent == pytest.approx(100.0 * (1.0 / scale - 1.0), rel=1e-6)
+
+
+def test_wrong_scale_alone_leaves_no_ate_with_scale() -> None:
+    truth = walk()
+    poses = truth.nav_T_body.copy()
+    poses[:, :3, 3] *= 0.97
+    figures = evaluate(Trajectory(truth.stamps_ns, poses).transformed(ELSEWHERE), truth)
+    assert figures.scale_error_percent == pytest.approx(-3.0)
+    assert figures.ate_scaled_m == pytest.approx(0.0, abs=1e-9)
+    assert figures.ate_position_m.rmse > 0.1
+
+
 def test_loop_closure_error_is_in_metres_and_percent() -> None:
     truth = walk(turns=1.0)
     poses = truth.nav_T_body.copy()
@@ -128,6 +155,7 @@ def test_evaluate_at_standstill_has_no_percentage() -> None:
     figures = evaluate(straight(100, np.zeros(3)).transformed(ELSEWHERE), straight(100, np.zeros(3)))
     assert figures.ate_percent is None
     assert figures.drift_percent is None
+    assert figures.scale_error_percent is None
     assert figures.loop_closure is None
     assert figures.ate_rotation_deg.max < 1e-6
     assert list(figures.rpe) == ["1 s"]

@@ -6,6 +6,8 @@ Definitions:
   ``max_gap_s`` apart; other estimates are left out and counted.
 - *ATE*: distance between positions, and angle between rotations, after SE(3) alignment of all associated
   positions (Umeyama's least squares without scale).
+- *Scale error*: by how much the estimate's lengths are too long, by the scale of Umeyama's Sim(3) alignment. What is
+  left of the ATE with that alignment is the part that neither a wrong baseline nor an unknown scale explains.
 - *RPE* over 1 s, or a distance along the truth: error of the motion from each pose to the pose nearest to that
   distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
 - *Drift*: position error of the last pose with the start aligned by position and rotation (the first 5 % of the path
@@ -30,6 +32,7 @@ from graphvio.evaluation.measures import (
     RelativeError,
     Stats,
     align,
+    align_scale,
     align_with_rotations,
     angle_between,
     relative_errors,
@@ -66,6 +69,8 @@ class Evaluation:
         ate_position_m: metres.
         ate_rotation_deg: degrees.
         ate_percent: ATE rmse in percent of the path; None for paths under 0.1 m.
+        scale_error_percent: of the estimate's lengths; None for paths under 0.1 m.
+        ate_scaled_m: ATE rmse of position after alignment with scale; None for paths under 0.1 m.
         drift_m: position error at the end with the start aligned.
         drift_percent: the same in percent of the path; None for paths under 0.1 m.
         loop_closure: None where the truth does not return to its start.
@@ -87,6 +92,8 @@ class Evaluation:
     ate_position_m: Stats
     ate_rotation_deg: Stats
     ate_percent: float | None
+    scale_error_percent: float | None
+    ate_scaled_m: float | None
     drift_m: float
     drift_percent: float | None
     loop_closure: LoopClosureError | None
@@ -136,6 +143,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
     path_m = float(at_estimates.distances[-1])
     drift_m = _drift(used, at_estimates)
     rpe, kitti = relative_errors(used, at_estimates)
+    scale = align_scale(aligned.positions, at_estimates.positions) if path_m >= _MIN_PATH_M else None
     return Evaluation(
         associated=len(used),
         estimates=len(estimate),
@@ -144,6 +152,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
         ate_position_m=(ate := Stats.of(position_m)),
         ate_rotation_deg=Stats.of(rotation_deg),
         ate_percent=_percent(ate.rmse, path_m),
+        scale_error_percent=None if scale is None else scale.error_percent,
+        ate_scaled_m=None if scale is None else scale.rmse_m,
         drift_m=drift_m,
         drift_percent=_percent(drift_m, path_m),
         loop_closure=_loop_closure(aligned, at_estimates, path_m),
