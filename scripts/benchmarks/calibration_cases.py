@@ -48,7 +48,17 @@ class Case:
 
 
 _SETTINGS = tuple(Case.__dataclass_fields__)
-_FIGURES = ("ate_cm", "epochs", "posed_percent", "frameset_ms", "pose_nees", "before", "after")
+_FIGURES = (
+    "ate_cm",
+    "ate_scaled_cm",
+    "scale_error_percent",
+    "epochs",
+    "posed_percent",
+    "frameset_ms",
+    "pose_nees",
+    "before",
+    "after",
+)
 
 
 def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
@@ -65,6 +75,8 @@ def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
                 writer.writerow((*_SETTINGS, *_FIGURES))
             figures = (
                 f"{100 * outcome.ate_m:.4f}",
+                f"{100 * outcome.ate_scaled_m:.4f}",
+                f"{outcome.scale_error_percent:.4f}",
                 outcome.epochs,
                 f"{outcome.posed_percent:.2f}",
                 f"{outcome.frameset_ms:.2f}",
@@ -88,6 +100,8 @@ def load_outcomes(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
     return {
         tuple(row[name] for name in _SETTINGS): CalibrationOutcome(
             ate_m=0.01 * float(row["ate_cm"]),
+            ate_scaled_m=0.01 * float(row["ate_scaled_cm"]),
+            scale_error_percent=float(row["scale_error_percent"]),
             epochs=int(row["epochs"]),
             posed_percent=float(row["posed_percent"]),
             frameset_ms=float(row["frameset_ms"]),

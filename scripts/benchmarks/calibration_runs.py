@@ -36,6 +36,8 @@ class CalibrationOutcome:
 
     Attributes:
         ate_m: rmse of the causal positions after alignment, all epochs as one; infinite where there are none.
+        ate_scaled_m: the same after alignment with scale, without what a wrong baseline makes of it.
+        scale_error_percent: of the estimate's lengths.
         epochs: how many there were.
         posed_percent: framesets that have a pose.
         frameset_ms: mean wall time of a frameset, with its decoding.
@@ -47,6 +49,8 @@ class CalibrationOutcome:
     """
 
     ate_m: float
+    ate_scaled_m: float
+    scale_error_percent: float
     epochs: int
     posed_percent: float
     frameset_ms: float
@@ -110,10 +114,11 @@ class WronglyCalibrated:
         poses: Float = np.array([e.nav_T_body for e in posed]).reshape(-1, 4, 4)
         try:
             estimated = Trajectory(np.array([e.stamp_ns for e in posed], dtype=np.int64), poses)
-            ate_m = evaluate(estimated, self._truth).ate_position_m.rmse
-            pose_nees = _pose_nees(posed, self._truth)
+            evaluation = evaluate(estimated, self._truth)
+            ate_m, pose_nees = evaluation.ate_position_m.rmse, _pose_nees(posed, self._truth)
+            ate_scaled_m, scale_error = evaluation.ate_scaled_m, evaluation.scale_error_percent
         except TrajectoryError:
-            ate_m, pose_nees = np.inf, np.nan
+            ate_m, pose_nees, ate_scaled_m, scale_error = np.inf, np.nan, None, None
         refined: Rig | None = getattr(odometry, "refined_rig", None)
         after = _rms(refined, true) if refined is not None else {}
         offset_s = estimates[-1].time_offset_s if estimates else None
@@ -121,6 +126,8 @@ class WronglyCalibrated:
             after["time_offset_ms"] = 1e3 * abs(offset_s - true.imu.time_offset_s)
         return CalibrationOutcome(
             ate_m=ate_m,
+            ate_scaled_m=np.inf if ate_scaled_m is None else ate_scaled_m,
+            scale_error_percent=np.nan if scale_error is None else scale_error,
             epochs=len({e.epoch for e in posed}),
             posed_percent=100.0 * len(posed) / max(len(estimates), 1),
             frameset_ms=1e3 * wall_s / max(len(estimates), 1),
