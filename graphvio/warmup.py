@@ -34,7 +34,7 @@ from graphvio.frontend.prediction import inverse_depths_around
 from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
 from graphvio.frontend.selection import best_pair_motion, joint_motion_known_depths
 from graphvio.frontend.singles import SinglesFrontend
-from graphvio.frontend.tracker import PairTracker
+from graphvio.frontend.tracker import GroupTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
 from graphvio.kernel_cache import any_compiled_before, cache_root
@@ -132,10 +132,10 @@ def _track_singles(rig: Rig, config: Config, rng: np.random.Generator) -> None:
 def _warm_up_tracking(rig: Rig, config: Config) -> None:
     """Call the kernels of tracking and of geometry."""
     rng = np.random.default_rng(0)
-    pair = rig.groups[0]
-    tracker = PairTracker(pair, config)
+    group = rig.groups[0]
+    tracker = GroupTracker(group, config)
     noise, in_right = (
-        rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in (pair.left, pair.cameras[-1])
+        rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in (group.left, group.cameras[-1])
     )
     for stamp_ns in range(2):
         frame = tracker.observe(stamp_ns, noise, in_right, np.eye(4), np.eye(4))
@@ -148,11 +148,11 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     if not rig.pairs:
         _track_singles(rig, config, rng)
     if any(camera.line_time_us for camera in rig.cameras):
-        pixels_at_lines(pair.left, frame.pixels, frame.points[:, 2], ReadoutMotion.steady(np.eye(4), 1.0))
+        pixels_at_lines(group.left, frame.pixels, frame.points[:, 2], ReadoutMotion.steady(np.eye(4), 1.0))
     undo_filters(np.frombuffer(bytes(2), dtype=np.uint8).reshape(1, 2), 1, np.zeros((2, 1), dtype=np.uint8))
     common_rows(frame.ids, frame.ids)
     orientations(noise, np.full((1, 2), 20.0))
-    pair.left.project(np.ones((1, 3)))
+    group.left.project(np.ones((1, 3)))
     se3(np.eye(3), np.zeros(3))
     se3_exp(np.zeros(6))
     skew(np.zeros(3))

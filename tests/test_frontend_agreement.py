@@ -17,7 +17,7 @@ from graphvio.frontend.pair_reports import pair_reports
 from graphvio.frontend.quality import StereoShare, graded, graded_hypothesis, stereo_share
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion_known_depths
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.frontend.visual import VisualFrontend, _Seen
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion
@@ -122,7 +122,7 @@ def test_doubt_lasts_a_second() -> None:
     frontend = VisualFrontend(RIG, Config())
     sides = {}
     for milliseconds, seen in ((0, slightly), (500, plainly), (1450, slightly), (1550, slightly)):
-        frames = {0: PairFrame.empty()}
+        frames = {0: TrackedFrame.empty()}
         tracked = _Seen(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
         agreement, _ = frontend._estimate_motion(tracked, lambda _: STILL)
         assert agreement is not None
@@ -220,7 +220,7 @@ def test_pair_report_has_the_pairs_own_error() -> None:
     agreement = agreement_of(seen)
     assert len(agreement.hypotheses) == 1
     rows = {j: np.arange(200) for j in range(2)}
-    frame = replace(PairFrame.empty(), ids=np.arange(200), ages=np.zeros(200, dtype=np.int64))
+    frame = replace(TrackedFrame.empty(), ids=np.arange(200), ages=np.zeros(200, dtype=np.int64))
     for j, sigma_px in enumerate((quiet_px, loud_px)):
         report = pair_reports({j: frame}, Correspondences(seen, rows, {0: 200, 1: 200}), agreement, {})[j]
         assert report.inliers > 180
@@ -232,7 +232,7 @@ def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() 
     seen = mixed((TRUTH, 120), (DOOR, 60))
     agreement = agreement_of(seen)
     rows = {0: np.arange(120), 1: np.arange(60)}
-    frame = replace(PairFrame.empty(), ids=np.arange(60), ages=np.zeros(60, dtype=np.int64))
+    frame = replace(TrackedFrame.empty(), ids=np.arange(60), ages=np.zeros(60, dtype=np.int64))
     report = pair_reports({1: frame}, Correspondences(seen, rows, {0: 120, 1: 60}), agreement, {})[1]
     assert (report.inliers, report.rms_px) == (0, None)
     assert report.own_rms_px == pytest.approx(0.2, rel=0.15)
@@ -369,8 +369,8 @@ def test_what_the_right_images_do_not_confirm_may_be_off_by_the_baseline() -> No
 
 
 def test_the_share_that_stereo_confirms_is_that_of_all_corners() -> None:
-    def frame(with_depth: int, of: int) -> PairFrame:
-        return replace(PairFrame.empty(), ids=np.arange(of), has_depth=np.arange(of) < with_depth)
+    def frame(with_depth: int, of: int) -> TrackedFrame:
+        return replace(TrackedFrame.empty(), ids=np.arange(of), has_depth=np.arange(of) < with_depth)
 
     reference, current = {0: frame(90, 100), 1: frame(80, 100)}, {0: frame(60, 100), 1: frame(4, 50)}
     share_of_stereo = stereo_share(reference, current, [0.1, 0.2])

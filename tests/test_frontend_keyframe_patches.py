@@ -9,7 +9,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Float, Image
 from graphvio.frontend.keyframe_patches import KeyframePatches
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.rig import Camera, StereoPair
 
 WIDTH, HEIGHT, FOCAL, BASELINE_M = 320, 240, 250.0, 0.1
@@ -39,14 +39,14 @@ def view(camera_T_first: Float) -> Image:
     return picture(waves(u, v) + 0.03 * np.random.default_rng(0).standard_normal(X.shape))
 
 
-def tracks() -> PairFrame:
+def tracks() -> TrackedFrame:
     """A grid of points on the wall, with what stereo matching would say of them."""
     x, y = np.meshgrid(np.arange(110.0, 231.0, 15.0), np.arange(60.0, 181.0, 15.0))
     pixels = np.column_stack([x.ravel(), y.ravel()]) + 0.3
     n = len(pixels)
     rays = (pixels - CENTRE) / FOCAL
     return replace(
-        PairFrame.empty(),
+        TrackedFrame.empty(),
         ids=10 + 2 * np.arange(n),
         ages=np.zeros(n, dtype=np.int64),
         pixels=pixels,
@@ -60,19 +60,19 @@ def tracks() -> PairFrame:
     )
 
 
-def seen_after(frame: PairFrame, left_T_left_keyframe: Float) -> Float:
+def seen_after(frame: TrackedFrame, left_T_left_keyframe: Float) -> Float:
     rays = np.column_stack([frame.left, np.ones(len(frame.ids))])
     points = rays / (rays @ WALL)[:, None] @ left_T_left_keyframe[:3, :3].T + left_T_left_keyframe[:3, 3]
     return np.asarray(FOCAL * points[:, :2] / points[:, 2:] + CENTRE)
 
 
-def placed(frame: PairFrame) -> KeyframePatches:
+def placed(frame: TrackedFrame) -> KeyframePatches:
     patches = KeyframePatches(pair(), WINDOW_PX)
     patches.take(frame, view(np.eye(4)))
     return patches
 
 
-def errors_px(frame: PairFrame, slopes: Float) -> tuple[Float, float]:
+def errors_px(frame: TrackedFrame, slopes: Float) -> tuple[Float, float]:
     """Errors of the patches that were found in a later view, and how many were."""
     truth = seen_after(frame, MOTION)
     guess = truth + np.random.default_rng(1).uniform(-0.5, 0.5, truth.shape)
@@ -105,8 +105,8 @@ def test_find_of_unknown_tracks_returns_the_guess() -> None:
     np.testing.assert_array_equal(pixels[~found], guess[~found])
 
 
-@pytest.mark.parametrize("frame", [None, PairFrame.empty()], ids=["never placed", "no tracks"])
-def test_find_without_patches_finds_nothing(frame: PairFrame | None) -> None:
+@pytest.mark.parametrize("frame", [None, TrackedFrame.empty()], ids=["never placed", "no tracks"])
+def test_find_without_patches_finds_nothing(frame: TrackedFrame | None) -> None:
     patches = KeyframePatches(pair(), WINDOW_PX) if frame is None else placed(frame)
     guess = np.array([[100.0, 80.0]])
     pixels, found = patches.find(np.array([0]), guess, view(np.eye(4)), np.eye(4), MIN_GRADIENT)

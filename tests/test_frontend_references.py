@@ -10,18 +10,18 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 
 NEAR, FAR = 0.5, 0.01  # 1/m
 SIGMA_W = 0.005  # of a depth, 1/m, for pixels of 1 px: near ones are known well, far ones hardly
 
 
-def frame(stamp_ns: int, inverse_depths: Float, first_id: int = 0) -> PairFrame:
+def frame(stamp_ns: int, inverse_depths: Float, first_id: int = 0) -> TrackedFrame:
     n = len(inverse_depths)
     covariances = np.zeros((n, 3, 3))
     covariances[:, 2, 2] = SIGMA_W**2
     return replace(
-        PairFrame.empty(stamp_ns),
+        TrackedFrame.empty(stamp_ns),
         ids=first_id + np.arange(n),
         ages=np.zeros(n, dtype=np.int64),
         pixels=np.zeros((n, 2)),
@@ -41,7 +41,7 @@ def explained(correspondences: Correspondences) -> Refined:
     return Refined(np.eye(4), np.eye(6), np.eye(6), np.ones(n, dtype=bool), np.zeros(n))
 
 
-def spent(reference: PairFrame, newest: PairFrame) -> bool:
+def spent(reference: TrackedFrame, newest: TrackedFrame) -> bool:
     references = References(MotionConfig())
     references.replace({0: reference})
     correspondences = correspond({0: reference}, {0: newest})

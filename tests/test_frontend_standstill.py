@@ -6,7 +6,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.frontend.standstill import Standstill
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 
 PERIOD_NS = 50_000_000
 PLACES = np.random.default_rng(0).uniform(0.0, 400.0, (60, 2))
@@ -18,7 +18,7 @@ def detected(shifts_px: Float, noise_px: float = 0.05, explained: int = 60) -> l
     for k, shift in enumerate(shifts_px):
         pixels = PLACES + [shift, 0.0] + noise_px * rng.standard_normal((60, 2))
         pixels[explained:] += 40.0 * k  # somebody walks by, whom the rig's motion does not explain
-        frame = replace(PairFrame.empty(k * PERIOD_NS), ids=np.arange(60), pixels=pixels)
+        frame = replace(TrackedFrame.empty(k * PERIOD_NS), ids=np.arange(60), pixels=pixels)
         detections.append(standstill.update({0: frame}, {0: np.arange(explained)}))
     return detections
 

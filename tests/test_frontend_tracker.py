@@ -16,8 +16,8 @@ from graphvio.config import Config
 from graphvio.config.stages import CornerConfig
 from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.matching import StereoMatcher
-from graphvio.frontend.tracker import PairTracker
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracker import GroupTracker
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.rig import Camera, StereoPair
 
 WIDTH, HEIGHT = 320, 240
@@ -77,10 +77,14 @@ def walk(frames: int) -> list[Float]:
 
 
 def followed(
-    poses: list[Float], *, with_keyframe: bool, tracker: PairTracker | None = None, replenished_at: tuple[int, ...] = ()
-) -> list[PairFrame]:
+    poses: list[Float],
+    *,
+    with_keyframe: bool,
+    tracker: GroupTracker | None = None,
+    replenished_at: tuple[int, ...] = (),
+) -> list[TrackedFrame]:
     """Frames of a walk, some of them with new corners."""
-    tracker = PairTracker(rectified(), Config()) if tracker is None else tracker
+    tracker = GroupTracker(rectified(), Config()) if tracker is None else tracker
     frames = []
     for k, pose in enumerate(poses):
         since_last = pose @ np.linalg.inv(poses[k - 1]) if k else None
@@ -144,7 +148,7 @@ def test_observe_counts_every_rejection() -> None:
 
 def test_new_corners_by_replenish_or_when_few_tracks_are_left() -> None:
     poses = walk(4)
-    tracker = PairTracker(rectified(), Config())
+    tracker = GroupTracker(rectified(), Config())
     first, second = followed(poses[:2], with_keyframe=True, tracker=tracker)
     assert np.isin(second.ids, first.ids).all()
     replenished = tracker.replenish()
@@ -166,7 +170,7 @@ def test_observe_leaves_earlier_frames_unchanged() -> None:
     """Frames are the front-end's references: following their tracks, foreseen or not, must not move them."""
     poses = walk(2)
     for predicted in (None, poses[1] @ np.linalg.inv(poses[0])):
-        tracker = PairTracker(rectified(), Config())
+        tracker = GroupTracker(rectified(), Config())
         first = tracker.observe(0, *views(poses[0]), None, None)
         tracker.keep_keyframe_patches()
         held: dict[str, AnyArray] = {name: v.copy() for name, v in vars(first).items() if isinstance(v, np.ndarray)}
@@ -178,7 +182,7 @@ def test_observe_leaves_earlier_frames_unchanged() -> None:
 
 
 def test_drop_removes_tracks() -> None:
-    tracker = PairTracker(rectified(), Config())
+    tracker = GroupTracker(rectified(), Config())
     poses = walk(2)
     first = tracker.observe(0, *views(poses[0]), None, None)
     tracker.drop(first.ids[::2])
@@ -189,7 +193,7 @@ def test_drop_removes_tracks() -> None:
 
 def test_observe_with_a_wrong_prediction_loses_few_tracks() -> None:
     poses = walk(2)
-    tracker = PairTracker(rectified(), Config())
+    tracker = GroupTracker(rectified(), Config())
     first = tracker.observe(0, *views(poses[0]), None, None)
     wrong = transform([0.0, 0.03, 0.0], [0.0, 0.0, 0.0])  # by 8 pixels: too far for the finest levels alone
     second = tracker.observe(1, *views(poses[1], 1), wrong, None)
@@ -201,7 +205,7 @@ def test_observe_through_a_fast_turn_finds_the_tracks() -> None:
     turned = transform([0.0, 0.24, 0.0], [0.0, 0.0, 0.0])
     shares, errors_px = [], []
     for predicted in (None, turned @ transform([0.01, -0.01, 0.01], [0.01, 0.0, 0.02])):  # not quite right
-        tracker = PairTracker(rectified(), Config())
+        tracker = GroupTracker(rectified(), Config())
         first = tracker.observe(0, *views(np.eye(4)), None, None)
         tracker.keep_keyframe_patches()
         second = tracker.observe(1, *views(turned, 1), predicted, predicted)
@@ -223,7 +227,7 @@ def mask_of(allowed: Bool, path: Path) -> Path:
 
 def test_left_mask_excludes_corners_and_tracks(tmp_path: Path) -> None:
     pair = rectified(left_mask=mask_of(X < 200, tmp_path / "left.png"))
-    for frame in followed(walk(4), with_keyframe=True, tracker=PairTracker(pair, Config())):
+    for frame in followed(walk(4), with_keyframe=True, tracker=GroupTracker(pair, Config())):
         assert len(frame.ids) > 10
         assert frame.pixels[:, 0].max() < 200.5 - 8.0  # no pixel of its patch of 15
 
@@ -234,7 +238,7 @@ def test_masked_pixels_do_not_influence_tracks(tmp_path: Path) -> None:
     results = []
     for grey in (0, 255):
         images = [np.where(X < 200, image, grey).astype(np.uint8) for image in views(np.eye(4))]
-        results.append(PairTracker(pair, Config()).observe(0, images[0], images[1], None, None))
+        results.append(GroupTracker(pair, Config()).observe(0, images[0], images[1], None, None))
     np.testing.assert_array_equal(results[0].pixels, results[1].pixels)
     np.testing.assert_array_equal(results[0].has_depth, results[1].has_depth)
     known = results[0].has_depth
@@ -245,8 +249,8 @@ def test_masked_pixels_do_not_influence_tracks(tmp_path: Path) -> None:
 def test_right_mask_excludes_matches(tmp_path: Path) -> None:
     pair = rectified(right_mask=mask_of(X < 200, tmp_path / "right.png"))
     images = views(np.eye(4))
-    frame = PairTracker(pair, Config()).observe(0, *images, None, None)
-    whole = PairTracker(rectified(), Config()).observe(0, *images, None, None)
+    frame = GroupTracker(pair, Config()).observe(0, *images, None, None)
+    whole = GroupTracker(rectified(), Config()).observe(0, *images, None, None)
     np.testing.assert_array_equal(frame.pixels, whole.pixels)
     hidden = frame.pixels[:, 0] - DISPARITY > 200.7 - 8.0
     clear = frame.pixels[:, 0] - DISPARITY < 198.5 - 8.0
@@ -279,8 +283,8 @@ def test_match_of_no_corner_in_the_right_image_is_rejected() -> None:
 def test_match_margin_finds_matches_beside_wrong_epipolar_lines(lower_px: float) -> None:
     pair, images = rectified(), views(np.eye(4))
     lower = replace(pair.right, intrinsics=pair.right.intrinsics + np.array([0.0, 0.0, 0.0, lower_px]))
-    exact = PairTracker(pair, Config()).observe(0, *images, None, None)
-    tracker = PairTracker(pair, Config())
+    exact = GroupTracker(pair, Config()).observe(0, *images, None, None)
+    tracker = GroupTracker(pair, Config())
     tracker.recalibrate(replace(pair, right=lower), 0.0)
     strict = tracker.observe(0, *images, None, None)
     tracker.recalibrate(replace(pair, right=lower), 3.0)
@@ -297,7 +301,7 @@ def test_match_margin_of_a_repeating_texture_leaves_the_epipolar_lines_where_the
     rng, squares = np.random.default_rng(4), np.where((X // 12 + Y // 12) % 2, 60.0, 190.0)
     noisy = (squares + rng.normal(0.0, 4.0, X.shape) for _ in range(2))
     left, right = (np.clip(image, 0, 255).astype(np.uint8) for image in noisy)
-    tracker = PairTracker(rectified(), Config())
+    tracker = GroupTracker(rectified(), Config())
     tracker.recalibrate(rectified(), 3.0)
     tracker.observe(0, left, right, None, None)
     assert not tracker.are_lines_off
@@ -316,8 +320,8 @@ def half_blank(brightness: float, noise: float, seed: int = 0) -> Image:
 @pytest.mark.parametrize("noise", [0.3, 0.7])
 def test_weak_corners_in_low_light_are_above_the_noise(noise: float) -> None:
     dark = half_blank(0.1, noise)
-    frame = PairTracker(rectified(), Config()).observe(0, dark, dark, None, None)
-    plain = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=0.0)))
+    frame = GroupTracker(rectified(), Config()).observe(0, dark, dark, None, None)
+    plain = GroupTracker(rectified(), Config(corners=CornerConfig(scarce_share=0.0)))
     plain.observe(0, dark, dark, None, None)
     assert len(plain.replenish().ids) < 6  # strong ones alone
     assert np.sum(frame.pixels[:, 0] < 165) > 12
@@ -326,7 +330,7 @@ def test_weak_corners_in_low_light_are_above_the_noise(noise: float) -> None:
 
 def test_weak_corners_are_tracked_and_matched() -> None:
     poses = walk(4)
-    tracker = PairTracker(rectified(), Config())
+    tracker = GroupTracker(rectified(), Config())
     for k, pose in enumerate(poses):
         left, right = views(pose, k, noise=3.0)
         left, right = (np.round(0.1 * image).astype(np.uint8) for image in (left, right))
@@ -338,7 +342,7 @@ def test_weak_corners_are_tracked_and_matched() -> None:
 def test_weak_corners_are_not_added_to_a_rich_image() -> None:
     frames = []
     for share in (0.0, CornerConfig().scarce_share):
-        tracker = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=share)))
+        tracker = GroupTracker(rectified(), Config(corners=CornerConfig(scarce_share=share)))
         frame = tracker.observe(0, *views(np.eye(4)), None, None)
         frames.append(frame if len(frame.ids) else tracker.replenish())
     np.testing.assert_array_equal(frames[0].pixels, frames[1].pixels)

@@ -16,7 +16,7 @@ from graphvio.arrays import AnyArray, Float, Image
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import WindowError
 from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.odometry.step import NewKeyframe, Step
@@ -341,7 +341,7 @@ def test_covariances_of_landmarks_are_consistent() -> None:
             seen.append(moved[:, :2] / moved[:, 2:] + sigma_px / f * rng.standard_normal((count, 2)))
         held, covariances, _ = triangulate(seen[0], seen[1], pair.right_T_left, float(focal[0]), float(focal[1]))
         whole = np.arange(count)
-        frame = PairFrame(
+        frame = TrackedFrame(
             0, whole, whole, seen[0], seen[0], seen[1], seen[1], held, covariances, np.zeros((count, 2)),
             np.ones(count, dtype=bool), whole,
         )  # fmt: skip

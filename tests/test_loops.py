@@ -12,7 +12,7 @@ import pytest
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import resect_features
@@ -25,7 +25,7 @@ CONFIG = Config()
 PIXEL_SIGMA = 0.5
 
 
-def frame(pair: StereoPair, points: Float, stamp_ns: int, rng: np.random.Generator) -> PairFrame:
+def frame(pair: StereoPair, points: Float, stamp_ns: int, rng: np.random.Generator) -> TrackedFrame:
     """Points (N, 3) in body as a pair sees them, with noisy pixels; those out of view have no depth."""
     seen = []
     for camera in (pair.left, pair.right):
@@ -36,7 +36,7 @@ def frame(pair: StereoPair, points: Float, stamp_ns: int, rng: np.random.Generat
     (pixels, left, in_left), (right_pixels, right, in_right) = seen
     triangulated, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
     none = np.zeros(len(points), dtype=np.int64)
-    return PairFrame(
+    return TrackedFrame(
         stamp_ns, np.arange(len(points)), none, pixels, left, right, right_pixels, triangulated, covariances,
         np.zeros((len(points), 2)), in_left & in_right, none,
     )  # fmt: skip
@@ -44,7 +44,7 @@ def frame(pair: StereoPair, points: Float, stamp_ns: int, rng: np.random.Generat
 
 def scene(
     rng: np.random.Generator, crossing: tuple[int, int], count: int
-) -> tuple[Float, dict[int, PairFrame], dict[int, PairFrame], Int]:
+) -> tuple[Float, dict[int, TrackedFrame], dict[int, TrackedFrame], Int]:
     """A motion after which pair b sees what pair a saw, the frames of both, and their matches (M, 2)."""
     a, b = (RIG.pairs[j] for j in crossing)
     shake = se3(so3_exp(rng.normal(0.0, 0.05, 3)), rng.normal(0.0, 0.2, 3))

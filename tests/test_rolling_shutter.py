@@ -15,7 +15,7 @@ from graphvio.config import Config
 from graphvio.evaluation import evaluate
 from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines, pixels_at_stamp
 from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.odometry.synchroniser import Synchroniser
@@ -83,7 +83,7 @@ def test_points_of_a_pair_are_triangulated_at_the_stamp() -> None:
     left, right = pair.left.unproject(left_px)[0], pair.right.unproject(right_px)[0]
     found, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
     n, whole = len(points), np.arange(len(points))
-    frame = PairFrame(
+    frame = TrackedFrame(
         0,
         whole,
         whole,

@@ -19,8 +19,8 @@ import graphvio.warmup
 from graphvio.arrays import Image
 from graphvio.cli import app
 from graphvio.config import Config
-from graphvio.frontend.tracker import PairTracker
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracker import GroupTracker
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.simulation import default_rig
 from graphvio.warmup import warm_up
 
@@ -40,13 +40,13 @@ def test_warm_up_of_a_pair_gives_each_camera_images_of_its_size(monkeypatch: pyt
     """Kernels trust the sizes: rows that are not there would be read and written."""
     pair = default_rig().pairs[0]
     small = replace(pair.right, size_px=(400, 200), distortion=np.zeros(8))
-    rig, given, observe = replace(default_rig(), pairs=(replace(pair, right=small),)), set(), PairTracker.observe
+    rig, given, observe = replace(default_rig(), pairs=(replace(pair, right=small),)), set(), GroupTracker.observe
 
-    def noting(self: PairTracker, stamp_ns: int, left: Image, right: Image, *others: Any) -> PairFrame:
+    def noting(self: GroupTracker, stamp_ns: int, left: Image, right: Image, *others: Any) -> TrackedFrame:
         given.add((left.shape[::-1], right.shape[::-1]))
         return observe(self, stamp_ns, left, right, *others)
 
-    monkeypatch.setattr(PairTracker, "observe", noting)
+    monkeypatch.setattr(GroupTracker, "observe", noting)
     warm_up(rig, Config())
     assert given == {(pair.left.size_px, small.size_px)}
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.measurements.motion import HandedOverTracks
 
 if TYPE_CHECKING:
-    from graphvio.frontend.tracker import PairTracker
+    from graphvio.frontend.tracker import GroupTracker
 
 
 class Leaving(NamedTuple):
@@ -62,7 +62,7 @@ class Handover:
         none = np.zeros(0, dtype=np.int64)
         self._handed_over = [HandedOverTracks(none, none, none) for _ in range(n_cameras)]  # whose rows are identities
 
-    def handed_over(self, camera: int, frame: PairFrame) -> HandedOverTracks:
+    def handed_over(self, camera: int, frame: TrackedFrame) -> HandedOverTracks:
         """Return the tracks of a frame that follow points of other cameras' tracks."""
         known = self._handed_over[camera]
         at = np.minimum(np.searchsorted(frame.ids, known.rows), max(len(frame.ids) - 1, 0))
@@ -70,7 +70,7 @@ class Handover:
         self._handed_over[camera] = known = HandedOverTracks(*(column[stays] for column in known))
         return known._replace(rows=at[stays])
 
-    def is_followed(self, camera: int, frames: Mapping[int, PairFrame]) -> Bool:
+    def is_followed(self, camera: int, frames: Mapping[int, TrackedFrame]) -> Bool:
         """Select the tracks (N,) of a camera whose point is still in the view of the camera that began it."""
         rows, cameras, ids = self.handed_over(camera, frames[camera])
         followed = np.zeros(len(frames[camera].ids), dtype=bool)
@@ -81,8 +81,8 @@ class Handover:
         return followed
 
     def adopt(
-        self, camera: int, tracker: PairTracker, frames: Mapping[int, PairFrame], found: Iterable[FoundThere]
-    ) -> PairFrame:
+        self, camera: int, tracker: GroupTracker, frames: Mapping[int, TrackedFrame], found: Iterable[FoundThere]
+    ) -> TrackedFrame:
         """Let a camera's tracker follow points that other cameras' tracks have in its image, where it has none.
 
         Args:

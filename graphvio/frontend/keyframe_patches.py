@@ -9,7 +9,7 @@ from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.matching import TwoCameras
 from graphvio.frontend.patches import packed
 from graphvio.frontend.prediction import around, inverse_depths_around, predict_warps
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.rig import CameraGroup, SingleCamera
 
 _MAX_REGISTRATION_PX = 2.0
@@ -23,51 +23,51 @@ class KeyframePatches:
     predicted motion and the slant of its surface, gives the point's place without that drift.
 
     Args:
-        pair: to which the left images belong, or the single camera.
+        group: the pair to which the left images belong, or the single camera.
         window_px: side of the patches; an even one counts as the next.
     """
 
-    def __init__(self, pair: CameraGroup, window_px: int) -> None:
-        self._pair = pair
+    def __init__(self, group: CameraGroup, window_px: int) -> None:
+        self._group = group
         self._half = window_px // 2
         side = 2 * self._half + 1
         self._step_px = float(np.sqrt((side**2 - 1) / 12.0))  # standard deviation of a patch's pixels
-        self._frame = PairFrame.empty()
+        self._frame = TrackedFrame.empty()
         self._image: AnyArray | None = None  # packed
         self._rays: Float = np.zeros((5, 0, 2))  # around each of the tracks
         self._inverse_depths: Float = np.zeros((5, 0))
 
-    def take(self, frame: PairFrame, image: Image) -> None:
+    def take(self, frame: TrackedFrame, image: Image) -> None:
         """Take the patches of a frame's tracks, from its left image (height, width)."""
         self._image = packed(image)
         self._place(frame)
 
-    def recalibrate(self, pair: CameraGroup) -> None:
+    def recalibrate(self, group: CameraGroup) -> None:
         """Take another calibration of the cameras."""
-        self._pair = pair
-        self._place(self._frame.recalibrated(pair))
+        self._group = group
+        self._place(self._frame.recalibrated(group))
 
-    def _place(self, frame: PairFrame) -> None:
+    def _place(self, frame: TrackedFrame) -> None:
         """Place the patches in space, by a frame's tracks."""
         self._frame = frame
         pixels = around(frame.pixels, self._step_px)
-        self._rays = self._pair.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
-        if isinstance(self._pair, SingleCamera):
+        self._rays = self._group.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
+        if isinstance(self._group, SingleCamera):
             self._inverse_depths = np.tile(np.maximum(frame.points[:, 2], 0.0), (5, 1))  # no slant is seen
             return
-        right = self._pair.right
+        right = self._group.right
         self._inverse_depths = inverse_depths_around(
             self._rays,
             np.maximum(frame.points[:, 2], 0.0),
             frame.slopes,
             self._step_px,
-            self._pair.right_T_left,
+            self._group.right_T_left,
             right.model_number,
             right.intrinsics,
             right.distortion,
         )
 
-    def slant(self, found: PairFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
+    def slant(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
         """Take the depth of patches of a single camera, and their slant, as another camera sees them.
 
         Args:
@@ -114,7 +114,7 @@ class KeyframePatches:
             return guess.copy(), np.zeros(len(ids), dtype=bool)
         rows = np.minimum(np.searchsorted(frame.ids, ids), len(frame.ids) - 1)
         wanted = (frame.ids[rows] == ids) & frame.has_depth[rows]
-        camera = self._pair.left
+        camera = self._group.left
         warps, shifts, usable = predict_warps(
             np.take(self._rays, rows, axis=1),  # indexing would have another layout, and for one row yet another
             np.take(self._inverse_depths, rows, axis=1),

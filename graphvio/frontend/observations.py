@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.kernels import kernel, put
 from graphvio.rig import Rig
 
@@ -152,7 +152,7 @@ class Correspondences:
 
     Attributes:
         observations: of all pairs.
-        rows: pair -> (M,) rows of the current `PairFrame` that take part, in order.
+        rows: pair -> (M,) rows of the current `TrackedFrame` that take part, in order.
         candidates: pair -> number of points that its reference had, of the pairs that take part.
         singles: which of them are single cameras.
     """
@@ -162,12 +162,12 @@ class Correspondences:
     candidates: Mapping[int, int]
     singles: frozenset[int] = frozenset()
 
-    def identities(self, frames: Mapping[int, PairFrame], inlier: Bool) -> dict[int, Int]:
+    def identities(self, frames: Mapping[int, TrackedFrame], inlier: Bool) -> dict[int, Int]:
         """Return pair -> identities, increasing, of its current tracks that are inliers among all points (N,)."""
         return {j: frames[j].ids[rows[inlier[self.observations.pair == j]]] for j, rows in self.rows.items()}
 
 
-def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame]) -> Correspondences:
+def correspond(reference: Mapping[int, TrackedFrame], current: Mapping[int, TrackedFrame]) -> Correspondences:
     """Join the tracks of two instants by their identities; points without depth at the reference stay out."""
     rows: dict[int, Int] = {}
     candidates: dict[int, int] = {}

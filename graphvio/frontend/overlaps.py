@@ -14,13 +14,13 @@ from graphvio.frontend.handover import FoundThere, Leaving
 from graphvio.frontend.lucas_kanade import Pyramid
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.prediction import predict_pixels
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.frontend.warped_matching import WarpedMatcher
 from graphvio.measurements.motion import CrossCameraMatches
 from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, StereoPair, axes_angle_deg, overlap
 
 if TYPE_CHECKING:
-    from graphvio.frontend.tracker import PairTracker
+    from graphvio.frontend.tracker import GroupTracker
 
 MIN_OVERLAP = 0.1
 """Smallest share of an image that is searched for in another camera's."""
@@ -41,7 +41,7 @@ class TrackedImage:
         min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
     """
 
-    frame: PairFrame
+    frame: TrackedFrame
     pyramid: Pyramid
     allowed: Bool
     min_gradient: float
@@ -66,7 +66,7 @@ class _Partner:
     camera: int
     cameras: TwoCameras  # of which the left one has the tracks
     matcher: StereoMatcher
-    found: PairFrame = field(default_factory=PairFrame.empty)
+    found: TrackedFrame = field(default_factory=TrackedFrame.empty)
 
 
 class Overlaps:
@@ -113,7 +113,7 @@ class Overlaps:
             if partner.camera in views:
                 self._find(partner, own, views[partner.camera], cam_T_before, searches, wanted)
 
-    def matches_of(self, camera: int, frame: PairFrame) -> tuple[CrossCameraMatches, ...]:
+    def matches_of(self, camera: int, frame: TrackedFrame) -> tuple[CrossCameraMatches, ...]:
         """Return where other cameras see the tracks of a camera's newest frame."""
         found = []
         for partner in self._partners[camera]:
@@ -151,7 +151,7 @@ class Overlaps:
                 found.append(FoundThere(own, there.ids[kept], there.right_pixels[kept], inverse_depths[kept]))
         return found
 
-    def slant(self, camera: int, tracker: PairTracker) -> None:
+    def slant(self, camera: int, tracker: GroupTracker) -> None:
         """Give a camera's tracker the depth of what was found last in the other cameras, and the slant where known."""
         for is_slope_known in (False, True):
             for partner in self._partners[camera]:
@@ -183,7 +183,7 @@ class Overlaps:
         chosen[:] = False
         chosen[rows] = True
         found = frame.keep(chosen)
-        new = PairFrame(
+        new = TrackedFrame(
             found.stamp_ns, found.ids, found.ages, found.pixels, found.left, matches.right[good],
             matches.right_pixels[good], matches.points[good], matches.covariances[good], matches.slopes[good],
             np.ones(len(rows), dtype=bool), found.frames_without_depth,
@@ -206,7 +206,7 @@ def _partner(own: Camera, number: int, other: Camera, config: Config) -> _Partne
     return _Partner(number, pair, StereoMatcher(pair, config, np.ones((height, width), dtype=bool)))
 
 
-def _agrees(there: PairFrame, leaving: Leaving, sigma_px: float) -> Bool:
+def _agrees(there: TrackedFrame, leaving: Leaving, sigma_px: float) -> Bool:
     """Select the matches (N,) of leaving tracks whose distance is that of their camera's own motion, within 3 sigma."""
     if not len(leaving.ids):
         return np.zeros(len(there.ids), dtype=bool)
@@ -216,7 +216,7 @@ def _agrees(there: PairFrame, leaving: Leaving, sigma_px: float) -> Bool:
     return np.asarray((leaving.ids[rows] == there.ids) & (off < _MAX_SIGMAS * sigmas))
 
 
-def _expected(partner: _Partner, frame: PairFrame, motion: Float | None) -> tuple[Float, Float]:
+def _expected(partner: _Partner, frame: TrackedFrame, motion: Float | None) -> tuple[Float, Float]:
     """Return the inverse depths (N,), NaN where unknown, and slopes (N, 2) that tracks were last found with."""
     inverse_depths, slopes, before = np.full(len(frame.ids), np.nan), np.zeros((len(frame.ids), 2)), partner.found
     if not len(before.ids):

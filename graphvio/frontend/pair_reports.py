@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Bool
 from graphvio.frontend.agreement import Agreement
 from graphvio.frontend.observations import Correspondences
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.measurements.motion import PairReport
 
 
@@ -22,10 +22,10 @@ def inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement
 
 
 def pair_reports(
-    frames: Mapping[int, PairFrame],
+    frames: Mapping[int, TrackedFrame],
     correspondences: Correspondences,
     agreement: Agreement | None,
-    replenished: Mapping[int, PairFrame],
+    replenished: Mapping[int, TrackedFrame],
 ) -> dict[int, PairReport]:
     """Return a report of each pair.
 
@@ -42,7 +42,9 @@ def pair_reports(
     }
 
 
-def _report(frame: PairFrame, correspondences: Correspondences, pair: int, agreement: Agreement | None) -> PairReport:
+def _report(
+    frame: TrackedFrame, correspondences: Correspondences, pair: int, agreement: Agreement | None
+) -> PairReport:
     is_inlier = np.zeros(len(frame.ids), dtype=bool)
     report = PairReport(0, 0, frame.pixels, is_inlier, frame.ages, frame.rejected)
     if pair not in correspondences.rows:

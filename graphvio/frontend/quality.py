@@ -10,7 +10,7 @@ import numpy as np
 
 from graphvio.arrays import Bool
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion
 
@@ -30,7 +30,7 @@ class StereoShare(NamedTuple):
 
 
 def stereo_share(
-    reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame], baselines_m: Sequence[float]
+    reference: Mapping[int, TrackedFrame], current: Mapping[int, TrackedFrame], baselines_m: Sequence[float]
 ) -> StereoShare:
     """Return the share for a frameset, in which a pair counts by its corners even if the motion explains none."""
     pairs = sorted(reference.keys() & current.keys())

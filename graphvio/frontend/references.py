@@ -11,7 +11,7 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.rig import Rig
 
 _T = THRESHOLDS.reference
@@ -22,18 +22,18 @@ class References:
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
-        self._frames: dict[int, PairFrame] = {}
+        self._frames: dict[int, TrackedFrame] = {}
 
     @property
     def stamps_ns(self) -> frozenset[int]:
         """Stamps of the framesets that later motions will be measured from."""
         return frozenset(frame.stamp_ns for frame in self._frames.values())
 
-    def of(self, pair: int) -> PairFrame | None:
+    def of(self, pair: int) -> TrackedFrame | None:
         """Return a pair's reference frame, or None."""
         return self._frames.get(pair)
 
-    def replace(self, frames: Mapping[int, PairFrame]) -> None:
+    def replace(self, frames: Mapping[int, TrackedFrame]) -> None:
         """Take frames as their pairs' references from now on."""
         self._frames.update(frames)
 
@@ -49,9 +49,9 @@ class References:
         """Forget a pair's reference."""
         self._frames.pop(pair, None)
 
-    def shared(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
+    def shared(self, frames: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:
         """Return reference frames of one stamp: where pairs have different ones, that with most tracks in common."""
-        groups: dict[int, dict[int, PairFrame]] = {}
+        groups: dict[int, dict[int, TrackedFrame]] = {}
         for j in frames:
             if j in self._frames:
                 groups.setdefault(self._frames[j].stamp_ns, {})[j] = self._frames[j]
@@ -64,7 +64,11 @@ class References:
         return groups[max(groups, key=lambda stamp_ns: (in_view(stamp_ns), stamp_ns))]
 
     def must_be_replaced(
-        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined, is_contradicted: bool
+        self,
+        frames: Mapping[int, TrackedFrame],
+        correspondences: Correspondences,
+        refined: Refined,
+        is_contradicted: bool,
     ) -> bool:
         """Decide whether the next motions are measured from the newest frames.
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.cameras import distort, fold_radius
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, so3_exp, so3_log
 from graphvio.kernels import kernel
 from graphvio.measurements.imu_interval import ImuInterval
@@ -90,7 +90,7 @@ def pixels_at_lines(camera: Camera, pixels: Float, inverse_depths: Float, motion
     return seen, depths
 
 
-def as_at_stamp(frame: PairFrame, group: CameraGroup, motion: ReadoutMotion) -> PairFrame:
+def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) -> TrackedFrame:
     """Return a frame whose points are as global shutters would have seen them at the stamp; pixels stay.
 
     The cameras of a pair have seen a point at nearly one instant, so that its depth is known before.

@@ -13,7 +13,7 @@ from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.frontend.visual import MotionPredictor, VisualFrontend
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet
@@ -91,7 +91,7 @@ class SinglesFrontend(VisualFrontend):
 
     @timed("elsewhere")
     def _match_across_cameras(
-        self, frames: dict[int, PairFrame], predict: MotionPredictor, searches: bool,
+        self, frames: dict[int, TrackedFrame], predict: MotionPredictor, searches: bool,
         wanted: Mapping[int, Bool] | None = None,
     ) -> dict[int, CameraTracks]:  # fmt: skip
         """Find each camera's tracks in the other cameras that see the same part of the scene.
@@ -112,7 +112,7 @@ class SinglesFrontend(VisualFrontend):
         return self._in_parallel(find, frames)
 
     @timed("handover")
-    def _handed_over(self, frames: dict[int, PairFrame]) -> dict[int, PairFrame]:
+    def _handed_over(self, frames: dict[int, TrackedFrame]) -> dict[int, TrackedFrame]:
         """Let cameras follow the points of tracks that are about to leave the others' views."""
         leaving = {j: self._leaving(j, frame) for j, frame in frames.items()}
         adopted = dict(frames)
@@ -121,9 +121,9 @@ class SinglesFrontend(VisualFrontend):
             adopted[j] = self._handover.adopt(j, self._trackers[j], frames, found)
         return adopted
 
-    def _leaving(self, camera: int, frame: PairFrame) -> Leaving:
+    def _leaving(self, camera: int, frame: TrackedFrame) -> Leaving:
         """Return the tracks that leave a camera's view soon, if they go on as since the last keyframe."""
-        reference = self._references.of(camera) or PairFrame.empty()
+        reference = self._references.of(camera) or TrackedFrame.empty()
         then, now = common_rows(reference.ids, frame.ids)
         ahead = frame.pixels[now] + _KEYFRAMES_AHEAD * (frame.pixels[now] - reference.pixels[then])
         margin, size = self._config.corners.border_px, np.array(self._rig.groups[camera].left.size_px)
@@ -133,7 +133,7 @@ class SinglesFrontend(VisualFrontend):
         return Leaving(frame.ids[now], frame.points[now, 2], sigmas)
 
     def _is_keyframe(
-        self, stamp_ns: int, frames: dict[int, PairFrame], predict: MotionPredictor, is_stationary: bool
+        self, stamp_ns: int, frames: dict[int, TrackedFrame], predict: MotionPredictor, is_stationary: bool
     ) -> bool:
         """Decide whether later tracks are registered on these images, and a state of the window stays."""
         if any(self._references.of(j) is None for j in frames):

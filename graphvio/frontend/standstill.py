@@ -8,7 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 
 _T = THRESHOLDS.standstill
 
@@ -17,9 +17,9 @@ class Standstill:
     """Compares each pair's frames with the one since which it may have stood still."""
 
     def __init__(self) -> None:
-        self._since: dict[int, PairFrame] = {}
+        self._since: dict[int, TrackedFrame] = {}
 
-    def update(self, frames: Mapping[int, PairFrame], explained: Mapping[int, Int]) -> bool:
+    def update(self, frames: Mapping[int, TrackedFrame], explained: Mapping[int, Int]) -> bool:
         """Return whether the rig has stood still for a while.
 
         Args:

@@ -19,7 +19,7 @@ from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, Mo
 from graphvio.frontend.overlaps import TrackedImage
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines
-from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
+from graphvio.frontend.tracks import TrackedFrame, common_rows, passes, usable_at
 from graphvio.rig import CameraGroup, StereoPair
 from graphvio.timing import Stopwatch
 
@@ -30,11 +30,11 @@ _MAX_FRAMES_WITHOUT_DEPTH = 3  # then the track is dropped for another corner of
 _LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks that fail are tried again with all
 
 
-class PairTracker:
+class GroupTracker:
     """Tracker of the corners of one stereo pair, or of a single camera, from frame to frame.
 
     Args:
-        pair: the cameras.
+        group: the cameras.
         config: of all stages.
         history: motions since the latest keyframes, by which a single camera's points are located.
         image_mask: masks of each image, or None.
@@ -42,26 +42,26 @@ class PairTracker:
 
     def __init__(
         self,
-        pair: CameraGroup,
+        group: CameraGroup,
         config: Config,
         history: MotionHistory | None = None,
         image_mask: ImageMask | None = None,
     ) -> None:
-        self._pair = pair
+        self._group = group
         self._config = config
-        self._cell_px = config.corners.cell_px(pair.left.size_px[0])
-        self._usable = [UsablePixels(camera, config.tracking.window_px, image_mask) for camera in pair.cameras]
+        self._cell_px = config.corners.cell_px(group.left.size_px[0])
+        self._usable = [UsablePixels(camera, config.tracking.window_px, image_mask) for camera in group.cameras]
         self._allowed = self._usable[0].always  # and what of the newest image is not masked
         self._matcher = None
-        if isinstance(pair, StereoPair):
-            self._matcher = StereoMatcher(pair, config, self._usable[1].always)
+        if isinstance(group, StereoPair):
+            self._matcher = StereoMatcher(group, config, self._usable[1].always)
         self._history, self._first_sights = history or MotionHistory(), FirstSights()
-        self._body_T_left = pair.left.body_T_cam
+        self._body_T_left = group.left.body_T_cam
         self._next_id = 0
-        self._last = replace(PairFrame.empty(), is_single=self._matcher is None)
+        self._last = replace(TrackedFrame.empty(), is_single=self._matcher is None)
         self._left: Pyramid = ()
         self._right: Pyramid = ()
-        self._patches = KeyframePatches(pair, config.tracking.window_px)
+        self._patches = KeyframePatches(group, config.tracking.window_px)
         self._noise_filter, self._noise_sigma = NoiseFilter(), 0.0
         self._motion: ReadoutMotion | None = None
 
@@ -74,7 +74,7 @@ class PairTracker:
         left_T_left_keyframe: Float | None,
         masks: tuple[Image | None, ...] = (None, None),
         motion: ReadoutMotion | None = None,
-    ) -> PairFrame:
+    ) -> TrackedFrame:
         """Follow the tracks, match them left to right and triangulate; replenish them where few are left.
 
         Args:
@@ -93,7 +93,7 @@ class PairTracker:
         self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:
             self._matcher.allow(self._usable[1].of(right, masks[1]))
-        self._motion = motion if any(camera.line_time_us for camera in self._pair.cameras) else None
+        self._motion = motion if any(camera.line_time_us for camera in self._group.cameras) else None
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths, is_in_view = self._predict(left_T_left_prev)
@@ -115,7 +115,7 @@ class PairTracker:
         self._last = replace(self._last, stage_ms=watch.stage_ms)
         return self.replenish() if self._share_of_cells(self._last) < self._config.corners.scarce_share else self._last
 
-    def replenish(self) -> PairFrame:
+    def replenish(self) -> TrackedFrame:
         """Add new corners to the newest frame, where no track constrains translation."""
         watch = Stopwatch()
         pixels = self._new_corners(self._last)
@@ -128,13 +128,13 @@ class PairTracker:
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         if self._matcher is None and self._history.newest_ns == self._last.stamp_ns:
             points, covariances = self._first_sights.locate(
-                self._last.ids, self._last.left, self._history, self._body_T_left, self._pair.left.focal_px,
+                self._last.ids, self._last.left, self._history, self._body_T_left, self._group.left.focal_px,
                 self._config.motion.pixel_sigma_px,
             )  # fmt: skip
             self._last = replace(self._last, points=points, covariances=covariances)
         return self._last
 
-    def adopt(self, pixels: Float, inverse_depths: Float) -> tuple[PairFrame, Int]:
+    def adopt(self, pixels: Float, inverse_depths: Float) -> tuple[TrackedFrame, Int]:
         """Follow points of the newest image from now on, where a single camera has no track near.
 
         Args:
@@ -175,26 +175,26 @@ class PairTracker:
         """Take another pose (4, 4) of a single camera from now on."""
         self._body_T_left = np.ascontiguousarray(body_T_left)
 
-    def recalibrate(self, pair: CameraGroup, epipolar_margin_px: float) -> None:
+    def recalibrate(self, group: CameraGroup, epipolar_margin_px: float) -> None:
         """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         if self._matcher is None:
-            self._first_sights.recalibrate(self._pair.left, pair.left)
-        elif isinstance(pair, StereoPair):
-            self._matcher.recalibrate(pair, epipolar_margin_px)
-        self._pair = pair
-        self._patches.recalibrate(pair)
-        self._last = self._last.recalibrated(pair)
+            self._first_sights.recalibrate(self._group.left, group.left)
+        elif isinstance(group, StereoPair):
+            self._matcher.recalibrate(group, epipolar_margin_px)
+        self._group = group
+        self._patches.recalibrate(group)
+        self._last = self._last.recalibrated(group)
 
     def limit_corners(self, share: float) -> None:
         """Use only a share of the image's cells, and so of the corners, from now on."""
-        self._cell_px = round(self._config.corners.cell_px(self._pair.left.size_px[0]) / np.sqrt(share))
+        self._cell_px = round(self._config.corners.cell_px(self._group.left.size_px[0]) / np.sqrt(share))
 
     def keep_keyframe_patches(self) -> None:
         """Register the tracks on the newest frame's patches from now on."""
         if self._left:
             self._patches.take(self._last, self._left[0])
 
-    def slant_keyframe_patches(self, found: PairFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
+    def slant_keyframe_patches(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
         """Take depth and slant of the patches as another camera sees them, see `KeyframePatches.slant`."""
         self._patches.slant(found, cameras, is_slope_known)
 
@@ -205,12 +205,12 @@ class PairTracker:
             stays[common_rows(self._last.ids, ids)[0]] = False
             self._last = self._last.keep(stays)
 
-    def _predict(self, left_T_left_prev: Float | None) -> tuple[PairFrame, Float, Float, Bool]:
+    def _predict(self, left_T_left_prev: Float | None) -> tuple[TrackedFrame, Float, Float, Bool]:
         """Select the tracks to follow, and predict their pixels (N, 2) and inverse depths (N,), NaN if unknown.
 
         The last of what is returned is whether each will still be in the image (N,).
         """
-        last, camera = self._last.keep(self._last.frames_without_depth <= _MAX_FRAMES_WITHOUT_DEPTH), self._pair.left
+        last, camera = self._last.keep(self._last.frames_without_depth <= _MAX_FRAMES_WITHOUT_DEPTH), self._group.left
         if left_T_left_prev is None:
             depths = np.where(last.has_depth, last.points[:, 2], np.nan)
             return last, last.pixels, depths, np.ones(len(last.ids), dtype=bool)
@@ -227,7 +227,7 @@ class PairTracker:
     def _follow(
         self,
         before: Pyramid,
-        last: PairFrame,
+        last: TrackedFrame,
         guess: Float,
         is_in_view: Bool,
         left_T_left_prev: Float | None,
@@ -259,9 +259,9 @@ class PairTracker:
         watch.lap("register")
         return pixels, found
 
-    def _follow_again(self, before: Pyramid, last: PairFrame, pixels: Float, found: Bool) -> tuple[Float, Bool]:
+    def _follow_again(self, before: Pyramid, last: TrackedFrame, pixels: Float, found: Bool) -> tuple[Float, Bool]:
         """Look for lost tracks where those that were found foretell them, or else where the whole image has moved."""
-        camera = self._pair.left
+        camera = self._group.left
         w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
         for _ in range(_MAX_ROUNDS):
             rays, has_ray = camera.unproject(pixels)
@@ -307,15 +307,15 @@ class PairTracker:
     def _matched(
         self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float,
         frames_without_depth: Int, rejected: dict[str, int],
-    ) -> PairFrame:  # fmt: skip
+    ) -> TrackedFrame:  # fmt: skip
         """Match tracks of the newest left image to the right one, and triangulate them."""
-        rays, has_ray = self._pair.left.unproject(pixels)
+        rays, has_ray = self._group.left.unproject(pixels)
         if self._matcher is None:
             frame = _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
-            return frame if self._motion is None else as_at_stamp(frame, self._pair, self._motion)
+            return frame if self._motion is None else as_at_stamp(frame, self._group, self._motion)
         matches = self._matcher.match(self._left, self._right, pixels, rays, inverse_depths, slopes, self._min_gradient)
         has_depth = matches.good & has_ray
-        frame = PairFrame(
+        frame = TrackedFrame(
             stamp_ns=stamp_ns,
             ids=ids,
             ages=ages,
@@ -330,21 +330,21 @@ class PairTracker:
             frames_without_depth=np.where(has_depth, 0, frames_without_depth + 1),
             rejected=rejected | matches.rejected,
         ).keep(has_ray)
-        return frame if self._motion is None else as_at_stamp(frame, self._pair, self._motion)
+        return frame if self._motion is None else as_at_stamp(frame, self._group, self._motion)
 
     @property
     def _min_gradient(self) -> float:
         """Smallest rms gradient along a patch's weaker direction; for pure noise it is 0.7 of the noise's deviation."""
         return min(MIN_GRADIENT, self._noise_sigma)
 
-    def _share_of_cells(self, frame: PairFrame, new: Float | None = None) -> float:
+    def _share_of_cells(self, frame: TrackedFrame, new: Float | None = None) -> float:
         """Compute the share of the image's cells that hold a track with depth, or a new corner (M, 2)."""
-        cell_px, (width, height) = self._cell_px, self._pair.left.size_px
+        cell_px, (width, height) = self._cell_px, self._group.left.size_px
         pixels = frame.pixels[frame.has_depth]
         both = pixels if new is None else np.concatenate([pixels, new])
         return float(occupied_cells(both, cell_px, -(-height // cell_px), -(-width // cell_px)).mean())
 
-    def _new_corners(self, frame: PairFrame) -> Float:
+    def _new_corners(self, frame: TrackedFrame) -> Float:
         """Find corners (M, 2) where no track of a frame constrains translation, weak ones too where there are few."""
         settings, image = self._config.corners, self._left[0]
         tracked, occupying = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
@@ -362,12 +362,12 @@ class PairTracker:
 
 def _unmatched(
     stamp_ns: int, ids: Int, ages: Int, pixels: Float, rays: Float, inverse_depths: Float, rejected: dict[str, int]
-) -> PairFrame:
+) -> TrackedFrame:
     """Return the tracks of a single camera, with the inverse depths (N,) that are expected where they are known."""
     n = len(ids)
     depths = np.where(np.isfinite(inverse_depths), inverse_depths, PRIOR_INVERSE_DEPTH)
     nothing, unmoved = np.zeros((n, 2)), np.zeros(n, dtype=np.int64)
-    return PairFrame(
+    return TrackedFrame(
         stamp_ns=stamp_ns,
         ids=ids,
         ages=ages,

@@ -17,7 +17,7 @@ _NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
 
 
 @dataclass(frozen=True, eq=False)
-class PairFrame:
+class TrackedFrame:
     """Observations of one pair, or of one single camera, at one instant: N tracks.
 
     Attributes:
@@ -83,13 +83,13 @@ class PairFrame:
         sigma_w = sigma_px * np.sqrt(self.covariances[:, 2, 2])
         return np.asarray(self.has_depth & (self.points[:, 2] > _NEAR_SIGMAS * sigma_w))
 
-    def keep(self, rows: Bool) -> PairFrame:
+    def keep(self, rows: Bool) -> TrackedFrame:
         """Return the frame with only some of its tracks (N,)."""
         if rows.all():
             return self
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
-    def extended(self, other: PairFrame) -> PairFrame:
+    def extended(self, other: TrackedFrame) -> TrackedFrame:
         """Append the tracks of another frame of this instant, whose ids are greater; counts and times add up."""
         both = self, other
         columns: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in both]) for name in _COLUMNS}
@@ -100,22 +100,22 @@ class PairFrame:
             stage_ms=_added(self.stage_ms, other.stage_ms),
         )
 
-    def recalibrated(self, pair: CameraGroup) -> PairFrame:
+    def recalibrated(self, group: CameraGroup) -> TrackedFrame:
         """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
-        left, has_ray = pair.left.unproject(self.pixels_at_stamp)
-        if isinstance(pair, SingleCamera):
+        left, has_ray = group.left.unproject(self.pixels_at_stamp)
+        if isinstance(group, SingleCamera):
             points = np.column_stack([left, self.points[:, 2]])
             return replace(self, left=left, points=points, has_depth=self.has_depth & has_ray)
-        right, in_right = pair.right.unproject(self.right_pixels_at_stamp)
-        points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
+        right, in_right = group.right.unproject(self.right_pixels_at_stamp)
+        points, covariances, _ = triangulate(left, right, group.right_T_left, group.left.focal_px, group.right.focal_px)
         has_depth = self.has_depth & has_ray & in_right
         return replace(self, left=left, right=right, points=points, covariances=covariances, has_depth=has_depth)
 
     @staticmethod
-    def empty(stamp_ns: int = 0) -> PairFrame:
+    def empty(stamp_ns: int = 0) -> TrackedFrame:
         """Return a frame without tracks."""
         none, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
-        return PairFrame(
+        return TrackedFrame(
             stamp_ns,
             ids=whole,
             ages=whole,
@@ -131,7 +131,9 @@ class PairFrame:
         )
 
 
-_COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns", "is_single", "rejected", "stage_ms"))
+_COLUMNS = tuple(
+    f.name for f in fields(TrackedFrame) if f.name not in ("stamp_ns", "is_single", "rejected", "stage_ms")
+)
 
 
 def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:

@@ -28,8 +28,8 @@ from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracker import PairTracker
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracker import GroupTracker
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import FrameSet
@@ -55,8 +55,8 @@ class _Seen(NamedTuple):
 
     stamp_ns: int
     frozen: Frozen
-    frames: dict[int, PairFrame]
-    reference: dict[int, PairFrame]
+    frames: dict[int, TrackedFrame]
+    reference: dict[int, TrackedFrame]
     correspondences: Correspondences
 
     @property
@@ -92,11 +92,11 @@ class VisualFrontend:
         self._rig = rig
         self._extrinsics = RigExtrinsics(rig, config)
         self._history = MotionHistory()
-        self._trackers = [PairTracker(group, config, self._history, image_mask) for group in rig.groups]
+        self._trackers = [GroupTracker(group, config, self._history, image_mask) for group in rig.groups]
         self._baselines_m = _baselines_m(rig)
         self._frozen = FrozenImages()
         self._all_frozen = False
-        self._latest: dict[int, PairFrame] = {}
+        self._latest: dict[int, TrackedFrame] = {}
         self._references = References(config.motion)
         # Errors of focal lengths and baselines scale all motions alike. No residual shows that, and an IMU must not be
         # corrected by it; without an IMU nothing shows the scale, and as noise it would only be smoothed.
@@ -127,7 +127,7 @@ class VisualFrontend:
         """Whether some pair's corners are found beside the epipolar lines of the calibration."""
         return any(tracker.are_lines_off for tracker in self._trackers)
 
-    def frames_at(self, stamp_ns: int) -> dict[int, PairFrame]:
+    def frames_at(self, stamp_ns: int) -> dict[int, TrackedFrame]:
         """Return the tracks of pairs and single cameras at the newest frameset, if it has this stamp."""
         return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
 
@@ -233,7 +233,7 @@ class VisualFrontend:
         if readout is None and self._has_rolling_shutter:
             readout = self._steady_readout(frameset.stamp_ns, predict)
 
-        def observe(j: int) -> PairFrame:
+        def observe(j: int) -> TrackedFrame:
             since_latest = self._predicted(j, self._latest.get(j), predict)
             if since_latest is None and turned is not None:
                 since_latest = self._predicted(j, self._latest.get(j), turned)
@@ -310,7 +310,7 @@ class VisualFrontend:
     @timed("replenish")
     def _replenish(
         self, seen: _Seen, agreement: Agreement | None
-    ) -> tuple[dict[int, PairFrame], dict[int, RelativeMotion]]:
+    ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
         """Start a keyframe with new corners if it is time to, and learn from the pairs' own motions until then.
 
         Returns:
@@ -341,7 +341,7 @@ class VisualFrontend:
         frames = {j: work(j) for j in ordered[:1]}
         return frames | {j: other.result() for j, other in others}
 
-    def _predicted(self, pair: int, then: PairFrame | None, predict: MotionPredictor) -> Float | None:
+    def _predicted(self, pair: int, then: TrackedFrame | None, predict: MotionPredictor) -> Float | None:
         """Predict the motion of points in a pair's left camera since one of its frames."""
         return None if then is None else self._moved(pair, predict(then.stamp_ns))
 
@@ -358,7 +358,7 @@ class VisualFrontend:
         cur_T_before = predict(before_ns) if before_ns < stamp_ns else None
         return None if cur_T_before is None else ReadoutMotion.steady(cur_T_before, 1e-9 * (stamp_ns - before_ns))
 
-    def _refer_to(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
+    def _refer_to(self, frames: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:
         """Measure the next motions from the newest frames of some pairs, and add corners to their tracks.
 
         Images that all repeat are of an earlier instant than their stamp: nothing is measured from them.

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from graphvio.arrays import Float, Image
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, RelativeMotion
@@ -26,7 +26,7 @@ class NewKeyframe:
         located_points: Called within the step, returns the points of single cameras that the state locates, by camera.
     """
 
-    frames: Mapping[int, PairFrame]
+    frames: Mapping[int, TrackedFrame]
     images: Mapping[int, tuple[Image, ...]]
     body_T_left: Float
     previous_ns: int | None

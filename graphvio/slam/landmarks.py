@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
-from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.kernels import kernel
 from graphvio.measurements.motion import LocatedPoints
 from graphvio.odometry.step import NewKeyframe
@@ -58,7 +58,7 @@ def landmarks_of(rig: Rig, keyframe: NewKeyframe, pixel_sigma_px: float, describ
     return Landmarks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _located(frame: PairFrame, body_T_left: Float, pixel_sigma_px: float) -> tuple[PairFrame, Float, Float]:
+def _located(frame: TrackedFrame, body_T_left: Float, pixel_sigma_px: float) -> tuple[TrackedFrame, Float, Float]:
     """Return the tracks of known depth, and their places (N, 3) in body with covariances, by the front-end."""
     sigma_w = pixel_sigma_px * np.sqrt(frame.covariances[:, 2, 2])
     frame = frame.keep(frame.has_depth & (frame.points[:, 2] > _MIN_DEPTH_SIGMAS * sigma_w))
@@ -73,7 +73,7 @@ def _located(frame: PairFrame, body_T_left: Float, pixel_sigma_px: float) -> tup
     return frame, in_left @ body_T_left[:3, :3].T + body_T_left[:3, 3], covariances
 
 
-def _rows(frame: PairFrame, rows: Int) -> PairFrame:
+def _rows(frame: TrackedFrame, rows: Int) -> TrackedFrame:
     chosen = np.zeros(len(frame.ids), dtype=bool)
     chosen[rows] = True
     return frame.keep(chosen)

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 from graphvio.optimization.loops.matching import alike
 from graphvio.optimization.record import SessionRecord
@@ -66,16 +66,16 @@ class Located:
         shifts: (S, K) of their inverse depths, 1/m, for one standard deviation of each of S errors.
     """
 
-    frame: PairFrame
+    frame: TrackedFrame
     shifts: Float
 
 
-def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> PairFrame:
+def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> TrackedFrame:
     """Return a frame of features (K, 2) of a single camera, none of which has a depth."""
     n = len(pixels)
     left, _ = camera.unproject(pixels)
     none = np.zeros(n, dtype=np.int64)
-    return PairFrame(
+    return TrackedFrame(
         stamp_ns, np.arange(n), none, pixels, left, np.zeros((n, 2)), np.zeros((n, 2)),
         np.column_stack([left, np.zeros(n)]), np.zeros((n, 3, 3)), np.zeros((n, 2)), np.zeros(n, dtype=bool), none,
         is_single=True,

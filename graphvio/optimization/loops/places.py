@@ -9,7 +9,7 @@ from graphvio.config import Config
 from graphvio.frontend.images import UsablePixels
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid
 from graphvio.frontend.matching import StereoMatcher
-from graphvio.frontend.tracks import PairFrame, usable_at
+from graphvio.frontend.tracks import TrackedFrame, usable_at
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Camera, StereoPair
@@ -70,7 +70,7 @@ class PairObserver(ImageObserver):
         images: tuple[Image, Image],
         pixels: Float,
         inverse_depths: Float | None = None,
-    ) -> PairFrame:
+    ) -> TrackedFrame:
         """Return a frame whose tracks are these features.
 
         Args:
@@ -84,7 +84,7 @@ class PairObserver(ImageObserver):
         n = len(pixels)
         expected = np.full(n, np.nan) if inverse_depths is None else inverse_depths
         matches = self._matcher.match(left, right, pixels, rays, expected, np.zeros((n, 2)), MIN_GRADIENT)
-        return PairFrame(
+        return TrackedFrame(
             stamp_ns=stamp_ns,
             ids=np.arange(n),
             ages=np.zeros(n, dtype=np.int64),

@@ -23,7 +23,7 @@ from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.refinement import Refined, refine
 from graphvio.frontend.selection import joint_motion_known_depths
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.motion_depth import FEATURE_SIGMA_PX
@@ -50,8 +50,8 @@ class Resection:
 
 def resect_features(
     rig: Rig,
-    reference: Mapping[int, PairFrame],
-    current: Mapping[int, PairFrame],
+    reference: Mapping[int, TrackedFrame],
+    current: Mapping[int, TrackedFrame],
     matches: Mapping[tuple[int, int], Int],
     config: Config,
     seed: Sequence[int],
@@ -89,7 +89,7 @@ def resect_features(
     return replace(found, shared_covariance=shared)
 
 
-def _shifts_of(reference: PairFrame, rows: Int, shifts: Float | None) -> Float:
+def _shifts_of(reference: TrackedFrame, rows: Int, shifts: Float | None) -> Float:
     """Return the shifts (S, M) of matched features that have a depth; of a pair's features (0, M)."""
     rows = rows[reference.has_depth[rows[:, 0]], 0]
     return np.zeros((0, len(rows))) if shifts is None else np.asarray(shifts[:, rows])
@@ -120,7 +120,7 @@ def _shared_covariance(
 
 
 def register_patches(
-    observers: Sequence[PairObserver], found: Resection, reference: Mapping[int, PairFrame],
+    observers: Sequence[PairObserver], found: Resection, reference: Mapping[int, TrackedFrame],
     images: tuple[FrameSet, FrameSet], config: Config, seed: Sequence[int],
 ) -> Resection:  # fmt: skip
     """Refine a motion by registering the patches of pairs that see the same points at both places.
@@ -154,8 +154,8 @@ def register_patches(
 
 
 def _registered(
-    observer: PairObserver, patches: KeyframePatches, known: PairFrame, now: FrameSet, j: int, cur_T_ref: Float
-) -> PairFrame:
+    observer: PairObserver, patches: KeyframePatches, known: TrackedFrame, now: FrameSet, j: int, cur_T_ref: Float
+) -> TrackedFrame:
     """Register the reference's patches in pair j's images of the current place."""
     camera, images = observer.pair.left, now.stereo[j]
     left_T_left = camera.cam_T_body @ cur_T_ref @ camera.body_T_cam
@@ -171,8 +171,8 @@ def _registered(
 
 
 def _observations(
-    reference: Mapping[int, PairFrame],
-    current: Mapping[int, PairFrame],
+    reference: Mapping[int, TrackedFrame],
+    current: Mapping[int, TrackedFrame],
     matches: Sequence[tuple[tuple[int, int], Int]],
 ) -> Observations:
     """Return matched features with depth at the reference, ordered by the pairs that saw them."""

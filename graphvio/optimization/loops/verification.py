@@ -12,7 +12,7 @@ import numpy as np
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config import Config
 from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import TrackedFrame
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import PairFeatures
@@ -40,7 +40,7 @@ class PlaceView(Protocol):
     def features(self, j: int) -> tuple[Float, AnyArray]:
         """Return pixels (K, 2) and descriptors (K, 128), uint8, of the left image, or of a single camera's."""
 
-    def frame(self, j: int) -> PairFrame:
+    def frame(self, j: int) -> TrackedFrame:
         """Return the same features with their depth; those of a single camera have none."""
 
     def frameset(self) -> FrameSet:
@@ -76,7 +76,7 @@ class StoredView:
         with self.lock:
             return self.database.pixels(name), self.database.descriptors(name)
 
-    def frame(self, j: int) -> PairFrame:
+    def frame(self, j: int) -> TrackedFrame:
         """See `PlaceView`."""
         group, left = self.rig.groups[j], self.name(j)
         if isinstance(group, SingleCamera):
@@ -108,7 +108,7 @@ class FreshView:
         """See `PlaceView`."""
         return self.seen[j].left, self.seen[j].descriptors
 
-    def frame(self, j: int) -> PairFrame:
+    def frame(self, j: int) -> TrackedFrame:
         """See `PlaceView`."""
         seen = self.seen[j]
         return frame_of(self.rig.groups[j], self.images.stamp_ns, seen.left, seen.right, seen.rows)
@@ -189,20 +189,20 @@ def _with_depth(view: PlaceView, j: int, neighbours: Neighbours) -> Located:
     return located_by_motion(group.left, frame.stamp_ns, Features(*view.features(j)), others)
 
 
-def frame_of(pair: CameraGroup, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> PairFrame:
+def frame_of(group: CameraGroup, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> TrackedFrame:
     """Return a frame of features (K, 2) of a left image, with depth where rows (M, 2) match the right one's."""
-    if isinstance(pair, SingleCamera):
-        return undetermined(pair.left, stamp_ns, pixels)
+    if isinstance(group, SingleCamera):
+        return undetermined(group.left, stamp_ns, pixels)
     n = len(pixels)
-    left, has_ray = pair.left.unproject(pixels)
+    left, has_ray = group.left.unproject(pixels)
     right, right_pixels = np.zeros((n, 2)), np.zeros((n, 2))
     right_pixels[rows[:, 0]] = in_right[rows[:, 1]]
-    right[rows[:, 0]], seen = pair.right.unproject(in_right[rows[:, 1]])
+    right[rows[:, 0]], seen = group.right.unproject(in_right[rows[:, 1]])
     has_depth = np.zeros(n, dtype=bool)
     has_depth[rows[:, 0]] = seen
-    points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
+    points, covariances, _ = triangulate(left, right, group.right_T_left, group.left.focal_px, group.right.focal_px)
     none = np.zeros(n, dtype=np.int64)
-    return PairFrame(
+    return TrackedFrame(
         stamp_ns, np.arange(n), none, pixels, left, right, right_pixels, points, covariances, np.zeros((n, 2)),
         has_depth & has_ray, none,
     )  # fmt: skip
