@@ -35,7 +35,7 @@ class FixedCalibration:
     def restart_imu(self) -> None:
         """Do nothing: there are no windows with samples."""
 
-    def with_allowance(self, visual: VisualResult) -> VisualResult:
+    def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
         """Return what vision measured, as it is."""
         return visual
 

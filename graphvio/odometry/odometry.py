@@ -359,7 +359,7 @@ class Odometry:
     @timed("update")
     def _gate(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Test the innovations, and insert the measurements that pass (section 5)."""
-        applied = self._estimator.apply(self._calibration.with_allowance(visual), is_stationary)
+        applied = self._estimator.apply(self._calibration.with_calibration_covariance(visual), is_stationary)
         if applied.needs_keyframe:
             self._frontend.start_keyframe()
         return applied

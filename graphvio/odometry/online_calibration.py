@@ -19,9 +19,9 @@ from graphvio.self_calibration.window import View
 class OnlineCalibration(Protocol):
     """The calibration of the rig while the odometry runs.
 
-    Once for each frameset: `with_allowance` before the state takes what vision measured, then `add` and `update`. Other
-    stages get a corrected calibration within `update`. What contradicts the rig file is reported as an event to the
-    function that the calibration is made with.
+    Once for each frameset: `with_calibration_covariance` before the state takes what vision measured, then `add` and
+    `update`. Other stages get a corrected calibration within `update`. What contradicts the rig file is reported as an
+    event to the function that the calibration is made with.
     """
 
     @property
@@ -49,8 +49,8 @@ class OnlineCalibration(Protocol):
     def restart_imu(self) -> None:
         """Forget the IMU samples until now: the IMU is left out, or those that follow are of another clock."""
 
-    def with_allowance(self, visual: VisualResult) -> VisualResult:
-        """Return what vision measured, with what innovation tests allow for errors of the calibration.
+    def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
+        """Return what vision measured, with the covariance that errors of the calibration add to its innovations.
 
         Args:
             visual: Of a frameset, to which the state has been predicted.

@@ -15,7 +15,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
-from graphvio.odometry.innovation_allowance import InnovationAllowance
+from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
 from graphvio.odometry.online_calibration import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
@@ -68,7 +68,7 @@ class PairsCalibration:
         self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()  # pairs
         self._calibration = SelfCalibration(rig)
-        self._allowance = None if rig.imu is None else InnovationAllowance(rig)
+        self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
         self._in_force = np.zeros_like(self.estimate.difference)  # of the calibration from the rig file
         self._margin_px = self._epipolar_margin_px()
@@ -99,15 +99,18 @@ class PairsCalibration:
         """Discard the window that is not full: it has samples of before."""
         self._calibration.restart_imu()
 
-    def with_allowance(self, visual: VisualResult) -> VisualResult:
+    def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
         """Attach to each motion the innovation covariance that errors of the calibration add."""
-        return visual if self._allowance is None else self._allowance.allow(visual, self._estimator)
+        if self._innovation_covariance is None:
+            return visual
+        return self._innovation_covariance.with_calibration_covariance(visual, self._estimator)
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
         """Add a frameset as a candidate for a keyframe, where its pose is of use."""
         calibration, estimator = self._calibration, self._estimator
-        if self._allowance is not None:
-            self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, calibration.widest)
+        if self._innovation_covariance is not None:
+            references = self._frontend.reference_stamps_ns
+            self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.widest)
         is_urgent = self._frontend.are_lines_off
         # Until the calibration is trusted, motions may be refused because of it.
         is_refused = status is Status.COASTING and not calibration.is_trusted
@@ -139,7 +142,7 @@ class PairsCalibration:
         self._frontend.recalibrate(self.estimate.rig, margin_px, self._calibration.extrinsics)
         change, n = self.estimate.difference - self._in_force, n_of_cameras(self._rig)
         self._in_force = self.estimate.difference
-        if self._allowance is not None and self._allowance.recalibrate(change[:n]):
+        if self._innovation_covariance is not None and self._innovation_covariance.recalibrate(change[:n]):
             self._frontend.start_keyframe()
         is_imu_changed = bool((np.abs(change) > _DISTRUST_SIGMAS * self.estimate.sigmas)[n:].any())
         if is_imu_changed and self._imu_fault_tolerant is not None:

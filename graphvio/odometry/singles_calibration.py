@@ -84,7 +84,7 @@ class SinglesCalibration:
         self._collector.restart()
         self._collector.forget_samples()
 
-    def with_allowance(self, visual: VisualResult) -> VisualResult:
+    def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
         """Return what vision measured, as it is: the window allows for errors of the calibration."""
         return visual
 

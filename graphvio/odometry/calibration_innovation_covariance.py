@@ -1,4 +1,4 @@
-"""What innovation tests allow for errors of the calibration, given how far the state has followed vision."""
+"""The covariance that errors of the calibration add to an innovation, given how far the state has followed vision."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Measured(NamedTuple):
         return self.motion.reference_stamp_ns == motion.reference_stamp_ns
 
 
-class InnovationAllowance:
+class CalibrationInnovationCovariance:
     """Adds to motions by vision the covariance by which errors of the calibration make them contradict the IMU.
 
     The state follows vision, and velocity and biases follow what the errors do. An innovation therefore contains what
@@ -54,7 +54,7 @@ class InnovationAllowance:
         self._velocities: dict[int, Float | None] = {}
         """The same one frameset before that and before those which motions are measured from."""
 
-    def add(self, stamp_ns: int, estimator: StateEstimator, references: Set[int], covariance: Float) -> None:
+    def add_frameset(self, stamp_ns: int, estimator: StateEstimator, references: Set[int], covariance: Float) -> None:
         """Update what the state has followed, by a frameset.
 
         Args:
@@ -96,7 +96,7 @@ class InnovationAllowance:
             if motion.by_depth_errors is not None
         )
 
-    def allow(self, visual: VisualResult, estimator: StateEstimator) -> VisualResult:
+    def with_calibration_covariance(self, visual: VisualResult, estimator: StateEstimator) -> VisualResult:
         """Return a frameset's result whose motions have the covariance that the calibration's errors add.
 
         Args:
@@ -107,10 +107,14 @@ class InnovationAllowance:
         self._tested = None if visual.motion is None else _Measured(visual.motion, pairs)
         if visual.motion is None or self._errors is None:
             return visual
-        alternatives = tuple(self._allowed(motion, pairs, estimator) for motion in visual.alternatives)
-        return replace(visual, motion=self._allowed(visual.motion, pairs, estimator), alternatives=alternatives)
+        alternatives = tuple(self._motion_with_covariance(motion, pairs, estimator) for motion in visual.alternatives)
+        return replace(
+            visual, motion=self._motion_with_covariance(visual.motion, pairs, estimator), alternatives=alternatives
+        )
 
-    def _allowed(self, motion: RelativeMotion, pairs: frozenset[int], estimator: StateEstimator) -> RelativeMotion:
+    def _motion_with_covariance(
+        self, motion: RelativeMotion, pairs: frozenset[int], estimator: StateEstimator
+    ) -> RelativeMotion:
         assert self._errors is not None
         since_ns = max(motion.reference_stamp_ns, self._followed_ns)
         now_T_since = estimator.motion_since(since_ns)

@@ -1,4 +1,4 @@
-"""What innovation tests allow for errors of the calibration: those of the way since vision was last followed."""
+"""The covariance that errors of the calibration add to innovations: of the way since vision was last followed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphvio.config import Config
 from graphvio.geometry import se3, se3_adjoint, se3_inverse, so3_exp
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.motion import PairReport, Quality, RelativeMotion, VisualResult
-from graphvio.odometry.innovation_allowance import InnovationAllowance
+from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.innovation import InnovationErrors
 from graphvio.self_calibration.parameters import PAIR, STEREO
@@ -48,25 +48,29 @@ class MovingEstimator(SmootherEstimator):
         return None if then is None else se3_inverse(self.poses[max(self.poses)]) @ then
 
 
-def allowed(allowance: InnovationAllowance, estimator: MovingEstimator, reference_ns: int) -> Float | None:
+def added_to_motion(
+    innovation_covariance: CalibrationInnovationCovariance, estimator: MovingEstimator, reference_ns: int
+) -> Float | None:
     """Return what is added to a motion from a reference to the newest state."""
     stamp_ns = max(estimator.poses)
     since = estimator.motion_since(reference_ns)
     measured = np.eye(4) if since is None else se3_inverse(since)
     motion = RelativeMotion(reference_ns, stamp_ns, measured, np.eye(6), np.zeros((6, 6)), 100)
-    found = allowance.allow(VisualResult(motion, Quality.GOOD, "", {}), estimator).motion
+    found = innovation_covariance.with_calibration_covariance(
+        VisualResult(motion, Quality.GOOD, "", {}), estimator
+    ).motion
     assert found is not None
     return found.calibration_covariance
 
 
 @pytest.mark.parametrize("refused", [0, 3])
-def test_innovation_allowance_is_for_the_way_since_vision_was_followed(refused: int) -> None:
-    allowance, estimator = InnovationAllowance(default_rig()), MovingEstimator()
+def test_calibration_covariance_is_for_the_way_since_vision_was_followed(refused: int) -> None:
+    innovation_covariance, estimator = CalibrationInnovationCovariance(default_rig()), MovingEstimator()
     for k in range(10):
         stamp_ns = estimator.move(is_accepted=k < 10 - refused)
-        allowance.add(stamp_ns, estimator, {0}, COVARIANCE)
+        innovation_covariance.add_frameset(stamp_ns, estimator, {0}, COVARIANCE)
     estimator.move(is_accepted=False)
-    found, errors = allowed(allowance, estimator, 0), InnovationErrors(COVARIANCE, default_rig())
+    found, errors = added_to_motion(innovation_covariance, estimator, 0), InnovationErrors(COVARIANCE, default_rig())
     assert found is not None
     way = np.linalg.matrix_power(STEP, 1 + refused)
     without_time_offset = errors.covariance(way, None, None)
@@ -75,22 +79,22 @@ def test_innovation_allowance_is_for_the_way_since_vision_was_followed(refused: 
     assert np.trace(found) < 0.5 * np.trace(errors.covariance(np.linalg.matrix_power(STEP, 10), None, None))
 
 
-def test_innovation_allowance_from_a_newer_reference_is_for_the_way_from_there() -> None:
-    allowance, estimator = InnovationAllowance(default_rig()), MovingEstimator()
+def test_calibration_covariance_from_a_newer_reference_is_for_the_way_from_there() -> None:
+    innovation_covariance, estimator = CalibrationInnovationCovariance(default_rig()), MovingEstimator()
     for k in range(6):
-        allowance.add(estimator.move(is_accepted=k < 2), estimator, {0, 4 * STEP_NS}, COVARIANCE)
-    found = allowed(allowance, estimator, 4 * STEP_NS)
+        innovation_covariance.add_frameset(estimator.move(is_accepted=k < 2), estimator, {0, 4 * STEP_NS}, COVARIANCE)
+    found = added_to_motion(innovation_covariance, estimator, 4 * STEP_NS)
     assert found is not None
     of_step = InnovationErrors(COVARIANCE, default_rig()).covariance(STEP, None, None)
     np.testing.assert_allclose(found[:3, :3], of_step[:3, :3], rtol=0.05)
 
 
-def test_innovation_allowance_before_the_first_frameset_and_from_a_forgotten_state_is_none() -> None:
-    allowance, estimator = InnovationAllowance(default_rig()), MovingEstimator()
+def test_calibration_covariance_before_the_first_frameset_and_from_a_forgotten_state_is_none() -> None:
+    innovation_covariance, estimator = CalibrationInnovationCovariance(default_rig()), MovingEstimator()
     estimator.move(is_accepted=True)
-    assert allowed(allowance, estimator, 0) is None
-    allowance.add(0, estimator, {0}, COVARIANCE)
-    assert allowed(allowance, estimator, 7) is None
+    assert added_to_motion(innovation_covariance, estimator, 0) is None
+    innovation_covariance.add_frameset(0, estimator, {0}, COVARIANCE)
+    assert added_to_motion(innovation_covariance, estimator, 7) is None
 
 
 # ------------------------------------------------------------------ errors within pairs
@@ -104,9 +108,9 @@ class Walk:
     """Steps, each of which is measured from the first frameset by one or both pairs."""
 
     def __init__(self) -> None:
-        self.allowance, self.estimator = InnovationAllowance(default_rig()), MovingEstimator()
+        self.innovation_covariance, self.estimator = CalibrationInnovationCovariance(default_rig()), MovingEstimator()
         self.estimator.move(is_accepted=True)
-        self.allowance.add(0, self.estimator, {0}, COVARIANCE)
+        self.innovation_covariance.add_frameset(0, self.estimator, {0}, COVARIANCE)
 
     def step(self, pairs: frozenset[int], is_accepted: bool = True) -> Float:
         """Return what is added to the motion."""
@@ -120,17 +124,17 @@ class Walk:
         motion = RelativeMotion(0, stamp_ns, se3_inverse(since), np.eye(6), np.zeros((6, 6)), 100, of_steps.sum(axis=0))
         report = PairReport(100, 100, np.zeros((0, 2)), np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), {})
         visual = VisualResult(motion, Quality.GOOD, "", dict.fromkeys(pairs, report))
-        found = self.allowance.allow(visual, self.estimator).motion
+        found = self.innovation_covariance.with_calibration_covariance(visual, self.estimator).motion
         assert found is not None
         assert found.calibration_covariance is not None
-        self.allowance.add(stamp_ns, self.estimator, {0}, COVARIANCE)
+        self.innovation_covariance.add_frameset(stamp_ns, self.estimator, {0}, COVARIANCE)
         return found.calibration_covariance
 
 
 BOTH, FRONT, BACK = frozenset({0, 1}), frozenset({0}), frozenset({1})
 
 
-def test_innovation_allowance_for_wrong_depths_is_for_the_way_since_vision_was_followed() -> None:
+def test_calibration_covariance_for_wrong_depths_is_for_the_way_since_vision_was_followed() -> None:
     walk, errors = Walk(), InnovationErrors(COVARIANCE, default_rig())
     found = [walk.step(BOTH, is_accepted) for is_accepted in (True, True, True, False, False, True)]
     of_step = np.trace(errors.of_depths(BY_DEPTH))
@@ -140,7 +144,7 @@ def test_innovation_allowance_for_wrong_depths_is_for_the_way_since_vision_was_f
     assert added[4] > 1.8 * added[2]  # nothing was followed for two steps
 
 
-def test_innovation_allowance_for_other_pairs_is_for_the_whole_way() -> None:
+def test_calibration_covariance_for_other_pairs_is_for_the_whole_way() -> None:
     of_pairs = Walk()
     walk = Walk()
     for _ in range(8):
@@ -150,11 +154,11 @@ def test_innovation_allowance_for_other_pairs_is_for_the_whole_way() -> None:
     assert np.trace(walk.step(BACK)) > 10.0 * np.trace(alone)
 
 
-def test_innovation_allowance_after_recalibration_is_for_the_whole_way() -> None:
+def test_calibration_covariance_after_recalibration_is_for_the_whole_way() -> None:
     walk, change = Walk(), np.zeros(2 * PAIR)
     for _ in range(8):
         before = walk.step(BOTH)
-    assert not walk.allowance.recalibrate(change)
+    assert not walk.innovation_covariance.recalibrate(change)
     assert np.trace(walk.step(BOTH)) > 10.0 * np.trace(before)
 
 
@@ -162,6 +166,6 @@ def test_recalibration_by_more_than_the_noise_of_motions_is_a_jump() -> None:
     walk, change = Walk(), np.zeros(2 * PAIR)
     walk.step(BOTH)
     change[STEREO : STEREO + 3] = 1e-3
-    assert not walk.allowance.recalibrate(change)  # the covariance of the motion is large
+    assert not walk.innovation_covariance.recalibrate(change)  # the covariance of the motion is large
     change[STEREO : STEREO + 3] = 1e3
-    assert walk.allowance.recalibrate(change)
+    assert walk.innovation_covariance.recalibrate(change)
