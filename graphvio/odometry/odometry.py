@@ -31,8 +31,8 @@ from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
 from graphvio.odometry.fixed_calibration import FixedCalibration
+from graphvio.odometry.frameset_imu import FramesetImu
 from graphvio.odometry.imu_clock import with_late_clock
-from graphvio.odometry.imu_of_framesets import ImuOfFramesets
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.pairs_calibration import PairsCalibration
@@ -112,7 +112,7 @@ class Odometry:
         self._frontend = (VisualFrontend if rig.pairs else SinglesFrontend)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
         self._estimator: StateEstimator = _estimator_class(rig, self.config)(rig, self.config, self.report)
-        self._imu = ImuOfFramesets(rig, self.config, self._synchroniser, self._estimator, self.report)
+        self._imu = FramesetImu(rig, self.config, self._synchroniser, self._estimator, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
         self._calibration = self._new_calibration()
@@ -350,7 +350,7 @@ class Odometry:
     def _track(self, frameset: FrameSet, predicted: _Predicted) -> VisualResult:
         """Track all pairs and measure the relative motion, eq. (1) to (4)."""
         readout = self._imu.readout_motion(frameset.stamp_ns)
-        visual = self._frontend.process(frameset, self._estimator.motion_since, readout, self._imu.turned_since)
+        visual = self._frontend.process(frameset, self._estimator.motion_since, readout, self._imu.gyro_rotation_since)
         if not predicted.is_initial:
             self._vision_events.update(frameset.stamp_ns, visual, self._frontend.extrinsic_errors)
         self.stage_ms.update(visual.stage_ms)

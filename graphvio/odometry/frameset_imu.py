@@ -24,7 +24,7 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
 
-class ImuOfFramesets:
+class FramesetImu:
     """The samples of a synchroniser, as an odometry uses them at each frameset.
 
     Args:
@@ -134,7 +134,7 @@ class ImuOfFramesets:
             )
         return interval
 
-    def turned_since(self, then_ns: int) -> Float | None:
+    def gyro_rotation_since(self, then_ns: int) -> Float | None:
         """Return ``now_T_then`` (4, 4) of body from a frameset to the newest one, by the gyro and without translation.
 
         It is what can be predicted while single cameras have no pose; None once they have, and if the gyro is doubted.
