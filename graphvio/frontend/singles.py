@@ -37,23 +37,23 @@ class SinglesFrontend(VisualFrontend):
     def process(
         self,
         frameset: FrameSet,
-        predict: MotionPredictor,
+        motion_since: MotionPredictor,
         readout: ReadoutMotion | None = None,
-        turned: MotionPredictor | None = None,
+        rotation_since: MotionPredictor | None = None,
     ) -> VisualResult:
         """Track the corners of a frameset.
 
         Args:
             frameset: Images of any subset of cameras.
-            predict: The back-end's prediction, from which the search begins.
+            motion_since: The back-end's predicted motion since an earlier stamp, from which the search begins.
             readout: Motion of body while rolling shutters read the images out, or None.
-            turned: The gyro's rotation alone, from which the search begins where nothing is predicted.
+            rotation_since: The rotation by the gyro alone, from which the search begins where no motion is predicted.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
         self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), predict, readout, turned)
+        seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
         is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
         reports = {
             j: PairReport(
@@ -62,18 +62,20 @@ class SinglesFrontend(VisualFrontend):
             )
             for j, frame in seen.frames.items()
         }  # fmt: skip
-        is_keyframe = not self._all_frozen and self._is_keyframe(seen.stamp_ns, seen.frames, predict, is_stationary)
+        is_keyframe = not self._all_frozen and self._is_keyframe(
+            seen.stamp_ns, seen.frames, motion_since, is_stationary
+        )
         if is_keyframe:
             reference = next(iter(seen.reference.values()), None)
-            cur_T_reference = None if reference is None else predict(reference.stamp_ns)
+            cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
             if reference is not None and cur_T_reference is not None:
                 self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
-        camera_tracks = self._match_across_cameras(seen.frames, predict, is_keyframe)
+        camera_tracks = self._match_across_cameras(seen.frames, motion_since, is_keyframe)
         if is_keyframe:
             before = seen.frames
             seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
             new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
-            camera_tracks = self._match_across_cameras(seen.frames, predict, is_keyframe, new)
+            camera_tracks = self._match_across_cameras(seen.frames, motion_since, is_keyframe, new)
             for j in seen.frames:
                 self._overlaps.slant(j, self._trackers[j])
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
@@ -91,7 +93,7 @@ class SinglesFrontend(VisualFrontend):
 
     @timed("elsewhere")
     def _match_across_cameras(
-        self, frames: dict[int, TrackedFrame], predict: MotionPredictor, searches: bool,
+        self, frames: dict[int, TrackedFrame], motion_since: MotionPredictor, searches: bool,
         wanted: Mapping[int, Bool] | None = None,
     ) -> dict[int, CameraTracks]:  # fmt: skip
         """Find each camera's tracks in the other cameras that see the same part of the scene.
@@ -105,7 +107,7 @@ class SinglesFrontend(VisualFrontend):
 
         def find(j: int) -> CameraTracks:
             chosen = ~of_others[j] if wanted is None else wanted[j]
-            self._overlaps.find(j, views, lambda then_ns: self._moved(j, predict(then_ns)), searches, chosen)
+            self._overlaps.find(j, views, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
             handed_over = self._handover.handed_over(j, frames[j])
             return CameraTracks(frames[j].ids, frames[j].left, self._overlaps.matches_of(j, frames[j]), handed_over)
 
@@ -133,7 +135,7 @@ class SinglesFrontend(VisualFrontend):
         return Leaving(frame.ids[now], frame.points[now, 2], sigmas)
 
     def _is_keyframe(
-        self, stamp_ns: int, frames: dict[int, TrackedFrame], predict: MotionPredictor, is_stationary: bool
+        self, stamp_ns: int, frames: dict[int, TrackedFrame], motion_since: MotionPredictor, is_stationary: bool
     ) -> bool:
         """Decide whether later tracks are registered on these images, and a state of the window stays."""
         if any(self._references.of(j) is None for j in frames):
@@ -148,7 +150,7 @@ class SinglesFrontend(VisualFrontend):
             assert reference is not None
             if cur_T_reference is None:
                 since_ns = stamp_ns - reference.stamp_ns
-                cur_T_reference = predict(reference.stamp_ns)
+                cur_T_reference = motion_since(reference.stamp_ns)
             then, now = common_rows(reference.ids, frame.ids)
             overlap, of_reference = overlap + len(then), of_reference + len(reference.ids)
             share = self._config.motion.keyframe_overlap * THRESHOLDS.reference.min_pair_share

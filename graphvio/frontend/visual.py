@@ -182,24 +182,24 @@ class VisualFrontend:
     def process(
         self,
         frameset: FrameSet,
-        predict: MotionPredictor,
+        motion_since: MotionPredictor,
         readout: ReadoutMotion | None = None,
-        turned: MotionPredictor | None = None,
+        rotation_since: MotionPredictor | None = None,
     ) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset.
 
         Args:
             frameset: Images of any subset of pairs.
-            predict: The back-end's prediction, from which the search begins.
+            motion_since: The back-end's predicted motion since an earlier stamp, from which the search begins.
             readout: Motion of body while rolling shutters read the images out; None continues that of the prediction.
-            turned: The gyro's rotation alone, from which the search for tracks begins where nothing is predicted.
+            rotation_since: The rotation by the gyro alone, from which the search begins where no motion is predicted.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
         self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), predict, readout, turned)
-        agreement, reason = self._estimate_motion(seen, predict)
+        seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
+        agreement, reason = self._estimate_motion(seen, motion_since)
         graded_motion = self._grade(seen, agreement, reason)
         replenished, own = self._replenish(seen, agreement)
         return VisualResult(
@@ -218,9 +218,9 @@ class VisualFrontend:
     def _track(
         self,
         frameset: FrameSet,
-        predict: MotionPredictor,
+        motion_since: MotionPredictor,
         readout: ReadoutMotion | None,
-        turned: MotionPredictor | None,
+        rotation_since: MotionPredictor | None,
     ) -> _Seen:
         """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
@@ -231,13 +231,13 @@ class VisualFrontend:
             self._references.forget(j)
 
         if readout is None and self._has_rolling_shutter:
-            readout = self._steady_readout(frameset.stamp_ns, predict)
+            readout = self._steady_readout(frameset.stamp_ns, motion_since)
 
         def observe(j: int) -> TrackedFrame:
-            since_latest = self._predicted(j, self._latest.get(j), predict)
-            if since_latest is None and turned is not None:
-                since_latest = self._predicted(j, self._latest.get(j), turned)
-            since_reference = self._predicted(j, self._references.of(j), predict)
+            since_latest = self._predicted(j, self._latest.get(j), motion_since)
+            if since_latest is None and rotation_since is not None:
+                since_latest = self._predicted(j, self._latest.get(j), rotation_since)
+            since_reference = self._predicted(j, self._references.of(j), motion_since)
             left, *right = frameset.images[j]
             masks = frameset.masks.get(j, (None, None))
             return self._trackers[j].observe(
@@ -252,7 +252,7 @@ class VisualFrontend:
         return _Seen(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
 
     @timed("motion")
-    def _estimate_motion(self, seen: _Seen, predict: MotionPredictor) -> tuple[Agreement | None, str]:
+    def _estimate_motion(self, seen: _Seen, motion_since: MotionPredictor) -> tuple[Agreement | None, str]:
         """Estimate the motion from all pairs, eq. (1) to (4), or return None and why there is none."""
         if not seen.reference:
             return None, seen.frozen.reason if self._all_frozen or not seen.frames else "first images"
@@ -260,7 +260,7 @@ class VisualFrontend:
         if len(observations.pair) < config.min_inliers:
             return None, f"only {len(observations.pair)} points in view"
         rng = np.random.default_rng([config.seed, seen.stamp_ns % 2**63])
-        predicted = predict(seen.reference_stamp_ns)
+        predicted = motion_since(seen.reference_stamp_ns)
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
             arrays = self._extrinsics.arrays
@@ -341,9 +341,9 @@ class VisualFrontend:
         frames = {j: work(j) for j in ordered[:1]}
         return frames | {j: other.result() for j, other in others}
 
-    def _predicted(self, pair: int, then: TrackedFrame | None, predict: MotionPredictor) -> Float | None:
+    def _predicted(self, pair: int, then: TrackedFrame | None, motion_since: MotionPredictor) -> Float | None:
         """Predict the motion of points in a pair's left camera since one of its frames."""
-        return None if then is None else self._moved(pair, predict(then.stamp_ns))
+        return None if then is None else self._moved(pair, motion_since(then.stamp_ns))
 
     def _moved(self, pair: int, cur_T_then: Float | None) -> Float | None:
         """Return the motion of points in a pair's left camera for one of body, by eq. (1)."""
@@ -352,10 +352,10 @@ class VisualFrontend:
         body_T_left = self._extrinsics.arrays.body_T_left[pair]
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
 
-    def _steady_readout(self, stamp_ns: int, predict: MotionPredictor) -> ReadoutMotion | None:
+    def _steady_readout(self, stamp_ns: int, motion_since: MotionPredictor) -> ReadoutMotion | None:
         """Continue the predicted motion since the images before, or return None where there is none."""
         before_ns = max((frame.stamp_ns for frame in self._latest.values()), default=stamp_ns)
-        cur_T_before = predict(before_ns) if before_ns < stamp_ns else None
+        cur_T_before = motion_since(before_ns) if before_ns < stamp_ns else None
         return None if cur_T_before is None else ReadoutMotion.steady(cur_T_before, 1e-9 * (stamp_ns - before_ns))
 
     def _refer_to(self, frames: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:

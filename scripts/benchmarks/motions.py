@@ -74,11 +74,11 @@ def log_vision(odometry: Odometry) -> VisionLog:
 
     def processed(
         frameset: FrameSet,
-        predict: MotionPredictor,
+        motion_since: MotionPredictor,
         readout: ReadoutMotion | None = None,
-        turned: MotionPredictor | None = None,
+        rotation_since: MotionPredictor | None = None,
     ) -> VisualResult:
-        result = vision_log.results[frameset.stamp_ns] = process(frameset, predict, readout, turned)
+        result = vision_log.results[frameset.stamp_ns] = process(frameset, motion_since, readout, rotation_since)
         return result
 
     def applied(visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
