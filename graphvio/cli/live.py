@@ -8,7 +8,6 @@ import typer
 
 from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
-from graphvio.cli.live_run import run_live
 
 
 def live(
@@ -52,23 +51,35 @@ def live(
 
         graphvio live realsense --cameras 0
     """
-    from graphvio.cli.services import Services
-
     if list_devices:
         _list()
         return
     if source is None:
         raise typer.BadParameter("give a SOURCE, or --list to see the connected devices")
+    from graphvio.cli.live_run import LiveOptions, run_live
+    from graphvio.cli.services import Services
+
     services = None
     if serve:
         from graphvio.slam.service.options import ServiceOptions
 
         services = Services(ServiceOptions())
     run_live(
-        source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=view,
-        health_port=health_port, duration_s=duration, forget_calibration=forget_calibration,
-        services=services,
-    )  # fmt: skip
+        LiveOptions(
+            source=source,
+            rig=rig,
+            config=config,
+            cameras=cameras,
+            no_pairs=no_pairs,
+            record=record,
+            png=png,
+            view=view,
+            health_port=health_port,
+            duration_s=duration,
+            forget_calibration=forget_calibration,
+            services=services,
+        )
+    )
 
 
 def _list() -> None:

@@ -1,159 +1,171 @@
-"""Runs the odometry on a live source with displays, recording and services around it, for several commands."""
+"""Runs the odometry on a live source with displays, recording and services around it, for several commands.
+
+Commands import it when they run: it imports all stages.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING
 
 import typer
 
+from graphvio.cli.dashboard import Dashboard, Figures, line_of, summary_of
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, reading_of, warn
+from graphvio.cli.warming import warm_up_visibly
+from graphvio.config import Config
+from graphvio.live.health import HealthServer
+from graphvio.live.outputs import ViewOutput
+from graphvio.live.running import LiveOdometry
+from graphvio.live.session_recorder import SessionRecorder
+from graphvio.runtime import StopSignals, set_up_threads, share_heap, sigterm_as_interrupt
 
 if TYPE_CHECKING:
     from graphvio.cli.services import Services, Started
-    from graphvio.config import Config
     from graphvio.live.calibration_memory import CalibrationMemory
-    from graphvio.live.running import LiveOdometry
     from graphvio.live.source import LiveSource
     from graphvio.rig import Rig
-    from graphvio.runtime import StopSignals
+    from graphvio.sessions.topics import ImageFormat
     from graphvio.viewer import Viewer
 
 
-def run_live(
-    source: str,
-    rig: Path | None,
-    config: str,
-    *,
-    cameras: str | None = None,
-    no_pairs: bool = False,
-    record: Path | None,
-    png: bool,
-    view: bool,
-    health_port: int | None,
-    duration_s: float | None,
-    forget_calibration: bool,
-    services: Services | None,
-) -> None:
-    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
-    from graphvio.cli.dashboard import line_of, summary_of
-    from graphvio.cli.warming import warm_up_visibly
-    from graphvio.config import Config
-    from graphvio.live.health import HealthServer
-    from graphvio.live.outputs import ViewOutput
-    from graphvio.live.running import LiveOdometry
-    from graphvio.live.session_recorder import SessionRecorder
-    from graphvio.runtime import StopSignals, set_up_threads, share_heap, sigterm_as_interrupt
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """What a live run is asked for.
 
-    if png and record is None:
-        raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
-    if record is not None:
-        _check_recording(record)
+    Attributes:
+        source: ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path.
+        rig: rig or calibration file, or None for what the source carries.
+        config: profile, or YAML file.
+        cameras: the only cameras to be used, such as ``cam0,cam1``, or None for all.
+        no_pairs: whether cameras are used without their partners.
+        record: session to be written, or None.
+        png: whether its images are compressed.
+        view: whether the viewer's window opens.
+        health_port: port of health and metrics, or None for none.
+        duration_s: the run ends after so many seconds, or with the source if None.
+        forget_calibration: whether what earlier runs learnt of the calibration is forgotten.
+        services: for other programs, or None.
+    """
+
+    source: str
+    rig: Path | None
+    config: str
+    cameras: str | None
+    no_pairs: bool
+    record: Path | None
+    png: bool
+    view: bool
+    health_port: int | None
+    duration_s: float | None
+    forget_calibration: bool
+    services: Services | None
+
+
+def run_live(options: LiveOptions) -> None:
+    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
+    _check_recording(options)
     share_heap()
-    settings = Config.load(config)
-    if services is not None:
-        settings = services.settings(settings)
-    opened = _opened(source, rig, cameras, no_pairs)
-    recorder: SessionRecorder | None = None
-    if services is not None:
-        services.check()
+    config = _config_of(options)
+    source = _source_of(options)
+    if options.services is not None:
+        options.services.check()
     with ExitStack() as stack:
-        stack.callback(opened.close)
+        stack.callback(source.close)
         with sigterm_as_interrupt():  # nothing has to be saved yet
-            used = opened.open()
-            memory = _memory(source, opened.name, used, settings, forget_calibration)
-            if memory is not None:
-                used = _remembered(memory, used)
-            set_up_threads()
-            warm_up_visibly(used, settings)  # measurements that come meanwhile are not used
+            rig, memory = _prepare(source, config, options)
         signals = stack.enter_context(StopSignals())
         recording = stack.enter_context(ExitStack())  # closed after the run, so that it is complete
-        viewer = _viewer(stack, used, view, services)
-        running = LiveOdometry(opened, used, settings, wants_keyframes=services is not None)
+        viewer = _viewer(stack, rig, options)
+        running = LiveOdometry(source, rig, config, wants_keyframes=options.services is not None)
         stack.callback(running.stop)
         if viewer is not None:
             running.add_output(ViewOutput(viewer, lambda: running.odometry.calibration))
-        if health_port is not None:
-            health = HealthServer(running.status, port=health_port)
-            stack.callback(health.close)
-            typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
-        started = None if services is None else services.start(running, stack, lambda: signals.came)
-        for line in () if started is None else started.lines:
-            typer.echo(line, err=True)
-        if record is not None:  # last, so that a port in use leaves no file behind
-            recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
-            recording.callback(recorder.close)
-            running.add_output(recorder)
+        _serve_health(stack, running, options)
+        started = _start_services(stack, running, signals, options)
+        recorder = _record(recording, running, source, options)  # last: a port in use leaves no file behind
         running.start()
-        failure: Exception | None = None
-        try:
-            _show_until_end(opened.name, running, signals, duration_s, started)
-            running.stop()
-        except Exception as error:  # raised after everything until then is saved
-            failure = error
-            with suppress(Exception):
-                running.stop()
+        failure = _run_until_end(source.name, running, signals, started, options)
         figures = running.status()
         is_whole = started is None or started.finish()
         if failure is not None:
             raise failure
-    publish({**figures, **({} if recorder is None else {"recording": str(record), **recorder.status()})})
-    typer.echo(line_of(figures))
-    typer.echo(summary_of(figures))
+    _report(figures, recorder, options)
     if memory is not None and figures.get("status_tracking"):
         _keep(memory, running)
-    if recorder is not None and record is not None:
-        is_whole = _print_recorded(record, recorder.status()) and is_whole
+    if recorder is not None and options.record is not None:
+        is_whole = _print_recorded(options.record, recorder.status()) and is_whole
     if not is_whole:
         raise typer.Exit(EXIT_INCOMPLETE)
 
 
-def _opened(source: str, rig: Path | None, cameras: str | None, no_pairs: bool) -> LiveSource:
+# ---------------------------------------------------------------------- before the run
+
+
+def _check_recording(options: LiveOptions) -> None:
+    """Refuse a session that cannot be written, before sensors are started."""
+    from graphvio.errors import SessionError
+    from graphvio.sessions.storage import exists_error
+
+    path = options.record
+    if path is None:
+        if options.png:
+            raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
+        return
+    check_session_name(path)
+    if path.exists():
+        raise exists_error(path)
+    if not path.parent.is_dir():
+        raise SessionError(f"{path}: {path.parent} is no folder; make it first")
+
+
+def _config_of(options: LiveOptions) -> Config:
+    """Load the configuration, with what the services need."""
+    config = Config.load(options.config)
+    return config if options.services is None else options.services.settings(config)
+
+
+def _source_of(options: LiveOptions) -> LiveSource:
     """Make a source as the options of a command ask for it; no sensor is started."""
     from graphvio.live.source import SelectedCameras
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
 
-    opened = open_live_source(source, None if rig is None else load_rig(rig))
-    if cameras is None and not no_pairs:
-        return opened
-    return SelectedCameras(opened, reading_of(cameras=cameras, no_pairs=no_pairs).of)
+    source = open_live_source(options.source, None if options.rig is None else load_rig(options.rig))
+    if options.cameras is None and not options.no_pairs:
+        return source
+    return SelectedCameras(source, reading_of(cameras=options.cameras, no_pairs=options.no_pairs).of)
 
 
-def _show_until_end(
-    name: str, running: LiveOdometry, signals: StopSignals, duration_s: float | None, started: Started | None
-) -> None:
-    """Show what happens until the source has ended, a signal came, or the time is over.
+def _prepare(source: LiveSource, config: Config, options: LiveOptions) -> tuple[Rig, CalibrationMemory | None]:
+    """Open a source and load the kernels.
 
-    Raises:
-        GraphvioError: that of a service which failed.
+    Returns:
+        The source's rig, calibrated as earlier runs learnt, and the memory of that; None where none is kept.
     """
-    from time import monotonic
-
-    from graphvio.cli.dashboard import Dashboard
-
-    until = None if duration_s is None else monotonic() + duration_s
-    with Dashboard(name, running.events.subscribe(64)) as dashboard:
-        while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
-            dashboard.show(running.status(), running.devices)
-            if started is not None:
-                started.check()
-    if signals.came:
-        typer.echo("stopping: measurements that have come are processed and saved", err=True)
+    rig = source.open()
+    memory = _memory(source.name, rig, config, options)
+    if memory is not None:
+        rig = _remembered(memory, rig)
+    set_up_threads()
+    warm_up_visibly(rig, config)  # measurements that come meanwhile are not used
+    return rig, memory
 
 
-def _memory(source: str, name: str, rig: Rig, settings: Config, forget_calibration: bool) -> CalibrationMemory | None:
+def _memory(name: str, rig: Rig, config: Config, options: LiveOptions) -> CalibrationMemory | None:
     """Return the memory of a source's calibration, emptied if it is to be, or None where none is kept."""
     from graphvio.live.calibration_memory import CalibrationMemory, devices_of
 
-    devices = devices_of(source, name)
-    if devices is None or not settings.estimates_calibration:
+    devices = devices_of(options.source, name)
+    if devices is None or not config.estimates_calibration:
         return None
     memory = CalibrationMemory(devices, rig)
-    if forget_calibration:
+    if options.forget_calibration:
         try:
             memory.forget()
         except OSError as error:
@@ -178,24 +190,108 @@ def _remembered(memory: CalibrationMemory, rig: Rig) -> Rig:
     return remembered.rig
 
 
+# ---------------------------------------------------------------------- around the run
+
+
+def _viewer(stack: ExitStack, rig: Rig, options: LiveOptions) -> Viewer | None:
+    """Open the viewer, if it is asked for, until the stack closes."""
+    from graphvio.viewer import Viewer, WebOptions
+
+    services = options.services
+    web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
+    viewer = stack.enter_context(Viewer(rig, spawn=options.view, web=web)) if options.view or web is not None else None
+    if web is not None:
+        typer.echo(f"browser: {web.url}", err=True)
+    return viewer
+
+
+def _serve_health(stack: ExitStack, running: LiveOdometry, options: LiveOptions) -> None:
+    """Serve health and metrics, if they are asked for, until the stack closes."""
+    if options.health_port is None:
+        return
+    health = HealthServer(running.status, port=options.health_port)
+    stack.callback(health.close)
+    typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
+
+
+def _start_services(
+    stack: ExitStack, running: LiveOdometry, signals: StopSignals, options: LiveOptions
+) -> Started | None:
+    """Start the services for other programs, if they are asked for, until the stack closes."""
+    if options.services is None:
+        return None
+    started = options.services.start(running, stack, lambda: signals.came)
+    for line in started.lines:
+        typer.echo(line, err=True)
+    return started
+
+
+def _record(
+    stack: ExitStack, running: LiveOdometry, source: LiveSource, options: LiveOptions
+) -> SessionRecorder | None:
+    """Record the run, if that is asked for, until the stack closes."""
+    if options.record is None:
+        return None
+    image_format: ImageFormat = "png" if options.png else "raw"
+    recorder = SessionRecorder(options.record, running.rig, image_format, waits=not source.is_realtime)
+    stack.callback(recorder.close)
+    running.add_output(recorder)
+    return recorder
+
+
+# ---------------------------------------------------------------------- the run, and what is said and kept at its end
+
+
+def _run_until_end(
+    name: str, running: LiveOdometry, signals: StopSignals, started: Started | None, options: LiveOptions
+) -> Exception | None:
+    """Run until the source has ended, a signal came, or the time is over.
+
+    Returns:
+        The error by which it ended, to be raised after everything until then is saved; None if there was none.
+    """
+    try:
+        _show_until_end(name, running, signals, options.duration_s, started)
+        running.stop()
+    except Exception as error:
+        with suppress(Exception):
+            running.stop()
+        return error
+    return None
+
+
+def _show_until_end(
+    name: str, running: LiveOdometry, signals: StopSignals, duration_s: float | None, started: Started | None
+) -> None:
+    """Show what happens until the source has ended, a signal came, or the time is over.
+
+    Raises:
+        GraphvioError: that of a service which failed.
+    """
+    until = None if duration_s is None else monotonic() + duration_s
+    with Dashboard(name, running.events.subscribe(64)) as dashboard:
+        while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
+            dashboard.show(running.status(), running.devices)
+            if started is not None:
+                started.check()
+    if signals.came:
+        typer.echo("stopping: measurements that have come are processed and saved", err=True)
+
+
+def _report(figures: Figures, recorder: SessionRecorder | None, options: LiveOptions) -> None:
+    """Print the figures of a run, and publish them with those of its recording."""
+    recorded = {} if recorder is None else {"recording": str(options.record), **recorder.status()}
+    publish({**figures, **recorded})
+    typer.echo(line_of(figures))
+    typer.echo(summary_of(figures))
+
+
 def _keep(memory: CalibrationMemory, running: LiveOdometry) -> None:
     try:
         if memory.keep(running.odometry):
             typer.echo(f"calibration: kept for the next run of {memory.name}")
     except OSError as error:
         warn(f"{memory.path}: what was learnt of the calibration cannot be kept ({error.strerror})")
-
-
-def _check_recording(path: Path) -> None:
-    """Refuse a session that cannot be written, before sensors are started."""
-    from graphvio.errors import SessionError
-    from graphvio.sessions.storage import exists_error
-
-    check_session_name(path)
-    if path.exists():
-        raise exists_error(path)
-    if not path.parent.is_dir():
-        raise SessionError(f"{path}: {path.parent} is no folder; make it first")
 
 
 def _print_recorded(path: Path, status: Mapping[str, float | int | str | None]) -> bool:
@@ -224,14 +320,3 @@ def _readable(path: Path) -> int:
         return open_source(path).frameset_count
     except GraphvioError:
         return 0
-
-
-def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:
-    """Open the viewer, if it is asked for, until the stack closes."""
-    from graphvio.viewer import Viewer, WebOptions
-
-    web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
-    viewer = stack.enter_context(Viewer(rig, spawn=view, web=web)) if view or web is not None else None
-    if web is not None:
-        typer.echo(f"browser: {web.url}", err=True)
-    return viewer

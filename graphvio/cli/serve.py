@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.live_run import run_live
 
 
 def serve(
@@ -49,12 +48,24 @@ def serve(
 
         graphvio serve oak --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file token
     """
+    from graphvio.cli.live_run import LiveOptions, run_live
     from graphvio.cli.services import Services
     from graphvio.slam.service.options import DEFAULT_PORT, ServiceOptions
 
     grpc = ServiceOptions(host, DEFAULT_PORT if port is None else port, certificate, key, token_file)
     run_live(
-        source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=False,
-        health_port=health_port, duration_s=duration, forget_calibration=forget_calibration,
-        services=Services(grpc, ros2, web),
-    )  # fmt: skip
+        LiveOptions(
+            source=source,
+            rig=rig,
+            config=config,
+            cameras=cameras,
+            no_pairs=no_pairs,
+            record=record,
+            png=png,
+            view=False,
+            health_port=health_port,
+            duration_s=duration,
+            forget_calibration=forget_calibration,
+            services=Services(grpc, ros2, web),
+        )
+    )

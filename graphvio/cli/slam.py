@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.live_run import run_live
 from graphvio.cli.services import Services, Started
 
 if TYPE_CHECKING:
@@ -64,13 +63,27 @@ def slam(
             raise MapError(f"{out}: holds a map already; name another folder, or extend it by  --map {out}")
     if save_rrd is not None and save_rrd.exists():
         raise MapError(f"{save_rrd}: exists; name another file for --save-rrd")
+    from graphvio.cli.live_run import LiveOptions, run_live
+
     services = _WithMapping(
         ServiceOptions(port=0), ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
     )
     run_live(
-        source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=False,
-        health_port=health_port, duration_s=duration, forget_calibration=forget_calibration, services=services,
-    )  # fmt: skip
+        LiveOptions(
+            source=source,
+            rig=rig,
+            config=config,
+            cameras=cameras,
+            no_pairs=no_pairs,
+            record=record,
+            png=png,
+            view=False,
+            health_port=health_port,
+            duration_s=duration,
+            forget_calibration=forget_calibration,
+            services=services,
+        )
+    )
 
 
 @dataclass(frozen=True)
