@@ -17,7 +17,7 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import Step
-from graphvio.results import ResultWriter, Summary
+from graphvio.results import FinishedRun, ResultWriter, Summary
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import described
@@ -148,7 +148,11 @@ class _Run:
         self._collect()
         for event in self._source.faults.events:
             self._writer.add_event(event)
-        return self._writer.finish(
+        return self._writer.finish(self._finished(wall_s), self._source.truth)
+
+    def _finished(self, wall_s: float) -> FinishedRun:
+        """Return what is known at the end of the run, which has taken a time."""
+        return FinishedRun(
             wall_s=wall_s,
             frameset_ms=self._frameset_ms,
             smoothed=sorted(self._smoothed, key=lambda stamped: stamped[0]),
@@ -159,7 +163,6 @@ class _Run:
             warnings=self._odometry.rig_warnings,
             calibration=described(self._odometry.calibration_findings),
             refined_rig=self._odometry.refined_rig,
-            truth=self._source.truth,
         )
 
     def _add_frameset(self, frameset: FrameSet) -> None:

@@ -12,7 +12,7 @@ from graphvio.geometry import se3, so3_exp
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.motion import PairReport
-from graphvio.results import PairMedians, ResultWriter, Summary
+from graphvio.results import FinishedRun, PairMedians, ResultWriter, Summary
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.rig_files import load_rig
 from graphvio.trajectory import Trajectory
@@ -75,7 +75,7 @@ def written(truth: Trajectory, folder: Path) -> Path:
 
 
 def finish(writer: ResultWriter, truth: Trajectory | None = None, framesets: int = COUNT) -> Summary:
-    return writer.finish(
+    run = FinishedRun(
         wall_s=1.5,
         frameset_ms=[1.0, 2.0, 3.0],
         smoothed=[(START_NS, pose(0)), (START_NS + STEP_NS, pose(1))],
@@ -83,8 +83,8 @@ def finish(writer: ResultWriter, truth: Trajectory | None = None, framesets: int
         framesets=framesets,
         awaited=COUNT - 5,
         resets=1,
-        truth=None if truth is None else written(truth, writer.folder),
     )
+    return writer.finish(run, None if truth is None else written(truth, writer.folder))
 
 
 def write_all(folder: Path, truth: Trajectory | None = None) -> Summary:

@@ -256,7 +256,7 @@ def test_viewer_with_unusable_path_raises(tmp_path: Path) -> None:
 
 
 def test_replay_shows_result_folder(tmp_path: Path) -> None:
-    from graphvio.results import ResultWriter
+    from graphvio.results import FinishedRun, ResultWriter
     from graphvio.viewer.replay import read_estimates, replay
 
     folder = tmp_path / "run-1"
@@ -267,13 +267,9 @@ def test_replay_shows_result_folder(tmp_path: Path) -> None:
         writer.add_event(Event(START_NS, EventKind.VISION_GATED, "front"))
         smoothed = [(e.stamp_ns, e.nav_T_body) for e in shown if e.nav_T_body is not None]
         writer.finish(
-            wall_s=1.0,
-            frameset_ms=[],
-            smoothed=smoothed,
-            input_faults={},
-            framesets=60,
-            awaited=60,
-            resets=1,
+            FinishedRun(
+                wall_s=1.0, frameset_ms=[], smoothed=smoothed, input_faults={}, framesets=60, awaited=60, resets=1
+            )
         )
     read = list(read_estimates(folder))
     assert [e.epoch for e in read] == [e.epoch for e in shown if e.nav_T_body is not None]

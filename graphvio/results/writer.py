@@ -13,11 +13,11 @@ import json
 import os
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, fields
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
 from graphvio.reporting.files import replace_file
 from graphvio.results.calibration_plot import CalibrationHistory
+from graphvio.results.finished_run import FinishedRun
 from graphvio.results.plotting import plot_run
 from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
@@ -48,6 +49,14 @@ _CALIBRATION_HEADER = "stamp_ns,parameter,difference,sigma"
 _PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
 _NS_PER_S = 1e9
+
+
+class _Comparison(NamedTuple):
+    """Truth and evaluation of a trajectory, None where they are not asked for or failed, and why that was."""
+
+    truth: Trajectory | None = None
+    evaluation: Evaluation | None = None
+    error: str | None = None
 
 
 class ResultWriter:
@@ -199,34 +208,11 @@ class ResultWriter:
         self._events[event.kind] += 1
         self._write("events.jsonl", json.dumps(asdict(event), ensure_ascii=False))
 
-    def finish(
-        self,
-        *,
-        wall_s: float,
-        frameset_ms: Sequence[float],
-        smoothed: Sequence[tuple[int, Float]],
-        input_faults: Mapping[str, int],
-        framesets: int,
-        awaited: int,
-        resets: int,
-        warnings: Sequence[str] = (),
-        calibration: Sequence[str] = (),
-        refined_rig: Rig | None = None,
-        truth: Path | None = None,
-    ) -> Summary:
-        """Write the smoothed trajectory, the summary and the plots.
+    def finish(self, run: FinishedRun, truth: Path | None = None) -> Summary:
+        """Write the smoothed trajectory, the refined rig, the summary and the plots.
 
         Args:
-            wall_s: processing time of the whole run.
-            frameset_ms: time per frameset, without decoding, milliseconds.
-            smoothed: stamps and poses ``nav_T_body`` (4, 4) as they left the smoother's window.
-            input_faults: kind -> count.
-            framesets: number of framesets read.
-            awaited: number of framesets that could have had a pose: those since the IMU's first sample.
-            resets: number of times that the estimator was reinitialised.
-            warnings: what to correct before the next run.
-            calibration: sentences on what the self-calibration found.
-            refined_rig: written to ``rig-refined.yaml``.
+            run: of which all estimates, calibrations and events have been added.
             truth: trajectory file or session to evaluate against; if that fails, the summary has the reason.
 
         Raises:
@@ -236,24 +222,31 @@ class ResultWriter:
         trajectory = Trajectory(
             np.array(self._stamps, dtype=np.int64), np.array(self._poses, dtype=np.float64).reshape(-1, 4, 4)
         )
-        true_trajectory, evaluation, evaluation_error = _evaluate_if_possible(trajectory, truth)
+        comparison = _compare_if_possible(trajectory, truth)
+        summary = self._summary(run, trajectory, comparison)
+        self._write_at_end(run, summary)
+        self._plot(trajectory, comparison)
+        return summary
+
+    def _summary(self, run: FinishedRun, trajectory: Trajectory, comparison: _Comparison) -> Summary:
         duration_s = (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if self._first_ns is not None else 0.0
         epochs = np.array(self._epochs, dtype=np.int64)
-        summary = Summary(
-            framesets=framesets,
+        evaluation = comparison.evaluation
+        return Summary(
+            framesets=run.framesets,
             estimated=len(trajectory),
-            completion=min(1.0, len(trajectory) / awaited) if awaited > 0 else 0.0,
+            completion=min(1.0, len(trajectory) / run.awaited) if run.awaited > 0 else 0.0,
             duration_s=duration_s,
             path_length_m=path_length(trajectory, epochs),
-            wall_s=wall_s,
-            realtime_factor=duration_s / wall_s if wall_s > 0 else 0.0,
+            wall_s=run.wall_s,
+            realtime_factor=duration_s / run.wall_s if run.wall_s > 0 else 0.0,
             stage_ms={stage: Percentiles.of(spent) for stage, spent in self._stage_ms.items()},
-            frameset_ms=Percentiles.of(frameset_ms),
-            input_faults=dict(input_faults),
-            resets=resets,
+            frameset_ms=Percentiles.of(run.frameset_ms),
+            input_faults=dict(run.input_faults),
+            resets=run.resets,
             events=dict(self._events),
-            warnings=list(warnings),
-            calibration=list(calibration),
+            warnings=list(run.warnings),
+            calibration=list(run.calibration),
             status=dict(self._status),
             pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
             pair_rejected={name: dict(sorted(counts.items())) for name, counts in self._pair_rejected.items()},
@@ -263,13 +256,19 @@ class ResultWriter:
             graphvio_version=__version__,
             config_sha256=self._config_sha256,
             evaluation=evaluation.as_dict() if evaluation else None,
-            evaluation_error=evaluation_error,
+            evaluation_error=comparison.error,
         )
-        lines = (f"{tum_line(int(stamp), np.asarray(pose))}\n" for stamp, pose in smoothed)
-        if refined_rig is not None:
-            save_rig(refined_rig, self.folder / "rig-refined.yaml")
+
+    def _write_at_end(self, run: FinishedRun, summary: Summary) -> None:
+        """Write the files that do not grow during a run."""
+        if run.refined_rig is not None:
+            save_rig(run.refined_rig, self.folder / "rig-refined.yaml")
+        lines = (f"{tum_line(int(stamp), np.asarray(pose))}\n" for stamp, pose in run.smoothed)
         self._write_at_once("trajectory_smoothed.txt", "".join(lines))
         self._write_at_once("summary.json", json.dumps(asdict(summary), indent=2, allow_nan=False) + "\n")
+
+    def _plot(self, trajectory: Trajectory, comparison: _Comparison) -> None:
+        """Plot the trajectory, and the calibration where one was estimated."""
         name = os.fsencode(self.folder.name).decode(errors="replace")  # what is no UTF-8 cannot be plotted
         plot_run(
             self.folder / "trajectory.png",
@@ -277,13 +276,12 @@ class ResultWriter:
             status=self._pose_status,
             epochs=self._epochs,
             lost_ns=self._lost if len(trajectory) else (),
-            truth=true_trajectory,
-            evaluation=evaluation,
+            truth=comparison.truth,
+            evaluation=comparison.evaluation,
             name=name,
         )
         if self._is_calibrated:
             self._calibrations.plot(self.folder / "calibration.png", self._last_ns, name)
-        return summary
 
     def _add_report(self, stamp_ns: int, name: str, report: PairReport) -> None:
         self._write("pairs.csv", _report_line(stamp_ns, name, report))
@@ -336,15 +334,13 @@ def _cannot_write(where: Path, error: OSError) -> GraphvioError:
     return GraphvioError(f"{where}: cannot be written ({error.strerror or error}); choose another place for results")
 
 
-def _evaluate_if_possible(
-    trajectory: Trajectory, truth: Path | None
-) -> tuple[Trajectory | None, Evaluation | None, str | None]:
-    """Truth and evaluation, or None for each that failed, and the reason."""
+def _compare_if_possible(trajectory: Trajectory, truth: Path | None) -> _Comparison:
+    """Evaluate a trajectory, or note why that failed."""
     if truth is None:
-        return None, None, None
+        return _Comparison()
     read = None
     try:
         read = load_trajectory(truth)
-        return read, evaluate(trajectory, read), None
+        return _Comparison(read, evaluate(trajectory, read))
     except TrajectoryError as error:
-        return read, None, str(error)
+        return _Comparison(read, error=str(error))
