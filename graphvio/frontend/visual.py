@@ -21,7 +21,7 @@ from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.motion_stereo import MotionHistory
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
-from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
+from graphvio.frontend.quality import GradedHypothesis, graded, graded_hypothesis, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.rolling_shutter import ReadoutMotion
@@ -71,7 +71,6 @@ class _Graded(NamedTuple):
     quality: Quality
     reason: str
     alternatives: tuple[RelativeMotion, ...] = ()
-    is_stationary: bool = False
 
 
 class VisualFrontend:
@@ -201,6 +200,8 @@ class VisualFrontend:
         seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
         agreement, reason = self._estimate_motion(seen, motion_since)
         graded_motion = self._grade(seen, agreement, reason)
+        is_stationary = self._detect_standstill(seen, agreement)
+        self._drop_outliers(seen, agreement)
         replenished, own = self._replenish(seen, agreement)
         return VisualResult(
             graded_motion.motion,
@@ -209,7 +210,7 @@ class VisualFrontend:
             pair_reports(seen.frames if seen.reference else replenished, seen.correspondences, agreement, replenished),
             alternatives=graded_motion.alternatives,
             own=own,
-            is_stationary=graded_motion.is_stationary,
+            is_stationary=is_stationary,
             frozen=seen.frozen.pairs,
             stage_ms=self.stage_ms,
         )
@@ -282,30 +283,33 @@ class VisualFrontend:
 
     @timed("quality")
     def _grade(self, seen: _Seen, agreement: Agreement | None, reason: str) -> _Graded:
-        """Decide how far the motion can be trusted, detect a standstill, and drop the tracks that are outliers."""
+        """Decide how far the motion can be trusted."""
         if agreement is None:
             return _Graded(None, Quality.FAILED, reason)
-        stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
-        hypotheses = [
-            graded_hypothesis(
-                self._with_depth_errors(self._relative_motion(seen, hypothesis.refined), seen, hypothesis.refined),
-                seen.frozen.all_since_ns,
-                stereo,
-                (hypothesis.refined.rms_px() or 0.0) / self._config.motion.pixel_sigma_px,
-            )
-            for hypothesis in agreement.hypotheses
-        ]
+        hypotheses = self._graded_hypotheses(seen, agreement)
         motion, quality, reason = graded(hypotheses, agreement.max_distance)
-        inlier = agreement.hypotheses[0].refined.inlier
-        is_stationary = self._standstill.update(seen.frames, seen.correspondences.identities(seen.frames, inlier))
-        for j, rows in seen.correspondences.rows.items():
-            self._trackers[j].drop(seen.frames[j].ids[rows[~inliers_of(j, seen.correspondences, agreement)]])
         alternatives = tuple(
             replace(graded_one.motion, pairs=hypothesis.pairs)
             for graded_one, hypothesis in zip(hypotheses, agreement.hypotheses, strict=True)
             if len(hypotheses) > 1
         )
-        return _Graded(motion, quality, reason, alternatives, is_stationary)
+        return _Graded(motion, quality, reason, alternatives)
+
+    @timed("quality")
+    def _detect_standstill(self, seen: _Seen, agreement: Agreement | None) -> bool:
+        """Return whether the points that the motion explains have stood still for a while; False without a motion."""
+        if agreement is None:
+            return False
+        explained = seen.correspondences.identities(seen.frames, agreement.hypotheses[0].refined.inlier)
+        return self._standstill.update(seen.frames, explained)
+
+    @timed("quality")
+    def _drop_outliers(self, seen: _Seen, agreement: Agreement | None) -> None:
+        """Drop the tracks that the motion does not explain; none without a motion."""
+        if agreement is None:
+            return
+        for j, rows in seen.correspondences.rows.items():
+            self._trackers[j].drop(seen.frames[j].ids[rows[~inliers_of(j, seen.correspondences, agreement)]])
 
     @timed("replenish")
     def _replenish(
@@ -375,6 +379,19 @@ class VisualFrontend:
             for j in replenished:
                 self._trackers[j].keep_keyframe_patches()
         return replenished
+
+    def _graded_hypotheses(self, seen: _Seen, agreement: Agreement) -> list[GradedHypothesis]:
+        """Check each motion hypothesis on its own."""
+        stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
+        return [
+            graded_hypothesis(
+                self._with_depth_errors(self._relative_motion(seen, hypothesis.refined), seen, hypothesis.refined),
+                seen.frozen.all_since_ns,
+                stereo,
+                (hypothesis.refined.rms_px() or 0.0) / self._config.motion.pixel_sigma_px,
+            )
+            for hypothesis in agreement.hypotheses
+        ]
 
     def _relative_motion(self, seen: _Seen, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
