@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
@@ -31,53 +32,33 @@ def estimate_without_pose(stamp_ns: int, visual: VisualResult, stage_ms: Mapping
     )
 
 
-def estimate_of(
+def estimate_by_measurements(
     stamp_ns: int,
     status: Status,
-    estimator: StateEstimator,
     visual: VisualResult,
     is_stationary: bool,
     rates: Mapping[str, Float],
     time_offset: TimeOffsetCorrection,
-    calibration: OnlineCalibration,
-    nav: NavFrame,
     stage_ms: Mapping[str, float],
 ) -> Estimate:
-    """Return the estimate of a frameset, without a pose where it is lost.
+    """Return what is estimated of a frameset beside the state, which `with_state` adds.
 
     Args:
         stamp_ns: Stamp of the frameset.
         status: What the pose is based on.
-        estimator: Updated by the frameset's measurements.
         visual: The front-end's result.
         is_stationary: Whether images, and the IMU if there is one, show a standstill.
         rates: Angular rates (3,) rad/s of body by source.
         time_offset: Estimate of the offset between cameras and IMU.
-        calibration: Knows what its errors add to the covariance of the pose.
-        nav: Frame of the estimate.
         stage_ms: Processing time by stage.
     """
-    of_calibration = calibration.pose_covariance(estimator.state().nav_T_body)
-    state, covariance = nav.state(estimator.state()), nav.covariance(estimator.covariance)
-    has_pose = status is not Status.LOST
     return Estimate(
-        stamp_ns=stamp_ns,
-        status=status,
-        nav_T_body=state.nav_T_body if has_pose else None,
-        covariance=covariance.pose + of_calibration if has_pose else None,
-        epoch=estimator.epoch,
-        velocity_nav=state.velocity_nav if has_pose else None,
-        gyro_bias=state.gyro_bias if estimator.has_imu else None,
-        accel_bias=state.accel_bias if estimator.has_imu else None,
-        velocity_covariance=covariance.velocity if has_pose else None,
-        gyro_bias_covariance=covariance.gyro_bias,
-        accel_bias_covariance=covariance.accel_bias,
-        gravity_nav=state.gravity_nav if estimator.has_imu and has_pose else None,
-        gravity_covariance=covariance.gravity if has_pose else None,
-        tilt_covariance=covariance.tilt if has_pose else None,
+        stamp_ns,
+        status,
+        None,
+        None,
         time_offset_s=time_offset.offset_s,
         time_offset_sigma_s=time_offset.sigma_s,
-        innovations=estimator.gate_results,
         rates=rates,
         vision=visual.quality,
         vision_reason=visual.reason,
@@ -85,6 +66,38 @@ def estimate_of(
         is_stationary=is_stationary,
         pairs=visual.pairs,
         stage_ms=stage_ms,
+    )
+
+
+def with_state(
+    estimate: Estimate, estimator: StateEstimator, calibration: OnlineCalibration, nav: NavFrame
+) -> Estimate:
+    """Return an estimate with the state that belongs to it, without a pose where it is lost.
+
+    Args:
+        estimate: Of a frameset, by its measurements.
+        estimator: Updated by them.
+        calibration: Knows what its errors add to the covariance of the pose.
+        nav: Frame of the estimate.
+    """
+    of_calibration = calibration.pose_covariance(estimator.state().nav_T_body)
+    state, covariance = nav.state(estimator.state()), nav.covariance(estimator.covariance)
+    has_pose, has_imu = estimate.status is not Status.LOST, estimator.has_imu
+    return replace(
+        estimate,
+        nav_T_body=state.nav_T_body if has_pose else None,
+        covariance=covariance.pose + of_calibration if has_pose else None,
+        epoch=estimator.epoch,
+        velocity_nav=state.velocity_nav if has_pose else None,
+        gyro_bias=state.gyro_bias if has_imu else None,
+        accel_bias=state.accel_bias if has_imu else None,
+        velocity_covariance=covariance.velocity if has_pose else None,
+        gyro_bias_covariance=covariance.gyro_bias,
+        accel_bias_covariance=covariance.accel_bias,
+        gravity_nav=state.gravity_nav if has_imu and has_pose else None,
+        gravity_covariance=covariance.gravity if has_pose else None,
+        tilt_covariance=covariance.tilt if has_pose else None,
+        innovations=estimator.gate_results,
     )
 
 

@@ -29,7 +29,7 @@ from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, cali
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
-from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
+from graphvio.odometry.assembly import estimate_by_measurements, estimate_without_pose, keyframe_of, with_state
 from graphvio.odometry.fixed_calibration import FixedCalibration
 from graphvio.odometry.frameset_imu import FramesetImu
 from graphvio.odometry.imu_clock import with_late_clock
@@ -407,18 +407,10 @@ class Odometry:
         """Assemble the estimate, and hand the step to those who listen."""
         estimator, interval = self._estimator, predicted.interval
         rates = self._rates.update(visual.motion, interval, estimator.state().gyro_bias, estimator.latest_rate())
-        estimate = estimate_of(
-            frameset.stamp_ns,
-            status,
-            estimator,
-            visual,
-            is_stationary,
-            rates,
-            self._time_offset,
-            self._calibration,
-            self._nav,
-            self.stage_ms,
+        measured = estimate_by_measurements(
+            frameset.stamp_ns, status, visual, is_stationary, rates, self._time_offset, self.stage_ms
         )
+        estimate = with_state(measured, estimator, self._calibration, self._nav)
         references, keyframe = self._frontend.reference_stamps_ns, None
         if frameset.stamp_ns in references:
             keyframe = keyframe_of(frameset, self._frontend, estimator, self._nav, self._keyframe_ns)
