@@ -18,7 +18,7 @@ from graphvio.frontend.quality import StereoShare, graded, graded_hypothesis, st
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion_known_depths
 from graphvio.frontend.tracks import TrackedFrame
-from graphvio.frontend.visual import VisualFrontend, _Seen
+from graphvio.frontend.visual import Seen, VisualFrontend
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion
 
@@ -123,7 +123,7 @@ def test_doubt_lasts_a_second() -> None:
     sides = {}
     for milliseconds, seen in ((0, slightly), (500, plainly), (1450, slightly), (1550, slightly)):
         frames = {0: TrackedFrame.empty()}
-        tracked = _Seen(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
+        tracked = Seen(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
         agreement, _ = frontend._estimate_motion(tracked, lambda _: STILL)
         assert agreement is not None
         sides[milliseconds] = len(agreement.hypotheses)

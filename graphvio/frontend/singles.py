@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from graphvio.arrays import Bool
+from graphvio.arrays import Bool, Int
 from graphvio.config import Config
 from graphvio.frontend.handover import Handover, Leaving
 from graphvio.frontend.images import ImageMask, checked
@@ -14,7 +14,7 @@ from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import TrackedFrame, common_rows
-from graphvio.frontend.visual import MotionPredictor, VisualFrontend
+from graphvio.frontend.visual import MotionPredictor, Seen, VisualFrontend
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
@@ -55,29 +55,15 @@ class SinglesFrontend(VisualFrontend):
         self.stage_ms = {}
         seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
         is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
-        reports = {
-            j: PairReport(
-                len(frame.ids), len(frame.ids), frame.pixels, np.ones(len(frame.ids), dtype=bool), frame.ages,
-                frame.rejected,
-            )
-            for j, frame in seen.frames.items()
-        }  # fmt: skip
+        reports = {j: _report(frame) for j, frame in seen.frames.items()}
         is_keyframe = not self._all_frozen and self._is_keyframe(
             seen.stamp_ns, seen.frames, motion_since, is_stationary
         )
         if is_keyframe:
-            reference = next(iter(seen.reference.values()), None)
-            cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
-            if reference is not None and cur_T_reference is not None:
-                self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
+            self._advance_history(seen, motion_since)
         camera_tracks = self._match_across_cameras(seen.frames, motion_since, is_keyframe)
         if is_keyframe:
-            before = seen.frames
-            seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
-            new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
-            camera_tracks = self._match_across_cameras(seen.frames, motion_since, is_keyframe, new)
-            for j in seen.frames:
-                self._overlaps.slant(j, self._trackers[j])
+            seen, camera_tracks = self._begin_keyframe(seen, motion_since)
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
         is_good = tracked >= self._config.motion.min_inliers
         return VisualResult(
@@ -90,6 +76,23 @@ class SinglesFrontend(VisualFrontend):
             stage_ms=self.stage_ms,
             camera_tracks={} if self._all_frozen else camera_tracks,
         )
+
+    def _advance_history(self, seen: Seen, motion_since: MotionPredictor) -> None:
+        """Note the predicted motion since the keyframe before, by which the new one locates points."""
+        reference = next(iter(seen.reference.values()), None)
+        cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
+        if reference is not None and cur_T_reference is not None:
+            self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
+
+    def _begin_keyframe(self, seen: Seen, motion_since: MotionPredictor) -> tuple[Seen, dict[int, CameraTracks]]:
+        """Register later tracks on these images, with handed over and new ones, which other cameras may see, too."""
+        before = seen.frames
+        seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
+        new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
+        camera_tracks = self._match_across_cameras(seen.frames, motion_since, True, new)
+        for j in seen.frames:
+            self._overlaps.slant(j, self._trackers[j])
+        return seen, camera_tracks
 
     @timed("elsewhere")
     def _match_across_cameras(
@@ -138,36 +141,61 @@ class SinglesFrontend(VisualFrontend):
         self, stamp_ns: int, frames: dict[int, TrackedFrame], motion_since: MotionPredictor, is_stationary: bool
     ) -> bool:
         """Decide whether later tracks are registered on these images, and a state of the window stays."""
-        if any(self._references.of(j) is None for j in frames):
+        references = {j: reference for j in frames if (reference := self._references.of(j)) is not None}
+        if len(references) < len(frames):
             return True
         if is_stationary:
             return False
-        parallaxes = []
-        overlap, of_reference = 0, 0
+        common = {j: common_rows(references[j].ids, frame.ids) for j, frame in frames.items()}
+        if self._lost_sight(references, common):
+            return True
+        if not any(len(then) for then, _ in common.values()):  # the reference is of the dark, and has no tracks to lose
+            return any(len(frame.ids) for frame in frames.values())
+        parallax, since_ns, is_predicted = self._parallax(frames, references, common, motion_since)
+        if not is_predicted:
+            return parallax > _MIN_PARALLAX and stamp_ns - since_ns >= _MIN_INTERVAL_NS
+        return parallax > _MAX_PARALLAX
+
+    def _lost_sight(self, references: Mapping[int, TrackedFrame], common: Mapping[int, tuple[Int, Int]]) -> bool:
+        """Whether too few tracks of the references go on: in any camera, or in all together."""
+        min_overlap = self._config.motion.keyframe_overlap
+        min_share = min_overlap * THRESHOLDS.reference.min_pair_share
+        overlaps = {j: len(then) for j, (then, _) in common.items()}
+        if any(overlaps[j] < min_share * len(reference.ids) for j, reference in references.items()):
+            return True
+        return sum(overlaps.values()) < min_overlap * sum(len(reference.ids) for reference in references.values())
+
+    def _parallax(
+        self,
+        frames: Mapping[int, TrackedFrame],
+        references: Mapping[int, TrackedFrame],
+        common: Mapping[int, tuple[Int, Int]],
+        motion_since: MotionPredictor,
+    ) -> tuple[float, int, bool]:
+        """Compute by how much rays have moved since the references, beside what a predicted rotation moves them.
+
+        Returns:
+            Their median displacement, the stamp of the reference that the rotation is predicted from, and whether it is
+            predicted at all.
+        """
+        displacements = []
         since_ns, cur_T_reference = 0, None
         for j, frame in frames.items():
-            reference = self._references.of(j)
-            assert reference is not None
+            reference, (then, now) = references[j], common[j]
             if cur_T_reference is None:
-                since_ns = stamp_ns - reference.stamp_ns
-                cur_T_reference = motion_since(reference.stamp_ns)
-            then, now = common_rows(reference.ids, frame.ids)
-            overlap, of_reference = overlap + len(then), of_reference + len(reference.ids)
-            share = self._config.motion.keyframe_overlap * THRESHOLDS.reference.min_pair_share
-            if len(then) < share * len(reference.ids):
-                return True
+                since_ns = reference.stamp_ns
+                cur_T_reference = motion_since(since_ns)
             rays = np.column_stack([reference.left[then], np.ones(len(then))])
             if cur_T_reference is not None:
                 body_R_cam = self._extrinsics.arrays.body_T_left[j][:3, :3]
                 rays = rays @ (body_R_cam.T @ cur_T_reference[:3, :3] @ body_R_cam).T
             ahead = rays[:, 2] > 0.1
             moved = frame.left[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]
-            parallaxes.append(np.hypot(moved[:, 0], moved[:, 1]))
-        if overlap < self._config.motion.keyframe_overlap * of_reference:
-            return True
-        if not overlap:  # the reference is of the dark, and has no track that could be lost
-            return any(len(frame.ids) for frame in frames.values())
-        parallax = float(np.median(np.concatenate(parallaxes)))
-        if cur_T_reference is None:
-            return parallax > _MIN_PARALLAX and since_ns >= _MIN_INTERVAL_NS
-        return parallax > _MAX_PARALLAX
+            displacements.append(np.hypot(moved[:, 0], moved[:, 1]))
+        return float(np.median(np.concatenate(displacements))), since_ns, cur_T_reference is not None
+
+
+def _report(frame: TrackedFrame) -> PairReport:
+    """Report a camera's tracks, all of which count as inliers: the back-end decides."""
+    n = len(frame.ids)
+    return PairReport(n, n, frame.pixels, np.ones(n, dtype=bool), frame.ages, frame.rejected)

@@ -42,7 +42,7 @@ MotionPredictor = Callable[[int], Float | None]
 _Result = TypeVar("_Result")
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
     """Tracks of a frameset.
 
     Attributes:
@@ -61,6 +61,7 @@ class _Seen(NamedTuple):
 
     @property
     def reference_stamp_ns(self) -> int:
+        """Stamp of the reference, if there is one."""
         return next(iter(self.reference.values())).stamp_ns
 
 
@@ -222,7 +223,7 @@ class VisualFrontend:
         motion_since: MotionPredictor,
         readout: ReadoutMotion | None,
         rotation_since: MotionPredictor | None,
-    ) -> _Seen:
+    ) -> Seen:
         """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
         self._all_frozen = frozen.all_since_ns is not None
@@ -250,10 +251,10 @@ class VisualFrontend:
         for stage in ("pyramid", "register", "flow", "stereo"):
             self.stage_ms[stage] = max((frame.stage_ms[stage] for frame in frames.values()), default=0.0)
         reference = self._references.shared(frames)
-        return _Seen(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
+        return Seen(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
 
     @timed("motion")
-    def _estimate_motion(self, seen: _Seen, motion_since: MotionPredictor) -> tuple[Agreement | None, str]:
+    def _estimate_motion(self, seen: Seen, motion_since: MotionPredictor) -> tuple[Agreement | None, str]:
         """Estimate the motion from all pairs, eq. (1) to (4), or return None and why there is none."""
         if not seen.reference:
             return None, seen.frozen.reason if self._all_frozen or not seen.frames else "first images"
@@ -282,7 +283,7 @@ class VisualFrontend:
         return agreement, ""
 
     @timed("quality")
-    def _grade(self, seen: _Seen, agreement: Agreement | None, reason: str) -> _Graded:
+    def _grade(self, seen: Seen, agreement: Agreement | None, reason: str) -> _Graded:
         """Decide how far the motion can be trusted."""
         if agreement is None:
             return _Graded(None, Quality.FAILED, reason)
@@ -296,7 +297,7 @@ class VisualFrontend:
         return _Graded(motion, quality, reason, alternatives)
 
     @timed("quality")
-    def _detect_standstill(self, seen: _Seen, agreement: Agreement | None) -> bool:
+    def _detect_standstill(self, seen: Seen, agreement: Agreement | None) -> bool:
         """Return whether the points that the motion explains have stood still for a while; False without a motion."""
         if agreement is None:
             return False
@@ -304,7 +305,7 @@ class VisualFrontend:
         return self._standstill.update(seen.frames, explained)
 
     @timed("quality")
-    def _drop_outliers(self, seen: _Seen, agreement: Agreement | None) -> None:
+    def _drop_outliers(self, seen: Seen, agreement: Agreement | None) -> None:
         """Drop the tracks that the motion does not explain; none without a motion."""
         if agreement is None:
             return
@@ -313,7 +314,7 @@ class VisualFrontend:
 
     @timed("replenish")
     def _replenish(
-        self, seen: _Seen, agreement: Agreement | None
+        self, seen: Seen, agreement: Agreement | None
     ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
         """Start a keyframe with new corners if it is time to, and learn from the pairs' own motions until then.
 
@@ -380,7 +381,7 @@ class VisualFrontend:
                 self._trackers[j].keep_keyframe_patches()
         return replenished
 
-    def _graded_hypotheses(self, seen: _Seen, agreement: Agreement) -> list[GradedHypothesis]:
+    def _graded_hypotheses(self, seen: Seen, agreement: Agreement) -> list[GradedHypothesis]:
         """Check each motion hypothesis on its own."""
         stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
         return [
@@ -393,7 +394,7 @@ class VisualFrontend:
             for hypothesis in agreement.hypotheses
         ]
 
-    def _relative_motion(self, seen: _Seen, refined: Refined) -> RelativeMotion:
+    def _relative_motion(self, seen: Seen, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
         angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3].copy())), np.linalg.norm(ref_T_cur[:3, 3])
         scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
@@ -407,7 +408,7 @@ class VisualFrontend:
             int(refined.inlier.sum()),
         )
 
-    def _with_depth_errors(self, motion: RelativeMotion, seen: _Seen, refined: Refined) -> RelativeMotion:
+    def _with_depth_errors(self, motion: RelativeMotion, seen: Seen, refined: Refined) -> RelativeMotion:
         """Add the derivatives by errors of the pairs' depths, by which an IMU may contradict the motion."""
         if not self._config.estimates_calibration or self._rig.imu is None:
             return motion
@@ -415,7 +416,7 @@ class VisualFrontend:
         derivatives = by_depth_errors(self._extrinsics.arrays, observations, refined.inlier, cur_T_ref)
         return replace(motion, by_depth_errors=derivatives)
 
-    def _own_motions(self, seen: _Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
+    def _own_motions(self, seen: Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
         """Return each pair's own motion without the corrections in force; with one pair alone, that is the rig's."""
         first = agreement.hypotheses[0]
         alone = {first.pairs[0]: first.refined} if len(self._rig.groups) == 1 else {}
