@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,37 +64,17 @@ def calibrate_pairs(
     rig = opened.rig
     if len(rig.pairs) < 2:
         raise CalibrationError(f"{rig.name} has one stereo pair; there is no other to calibrate it against")
-    separate = SeparateMotions(rig, config or Config())
-    stamps_ns: list[int] = []
-    gyro: list[Float] = []
-    number = 0
-    try:
-        for measurement in opened:
-            if isinstance(measurement, ImuSample):
-                stamps_ns.append(measurement.stamp_ns)
-                gyro.append(measurement.angular_velocity)
-            elif isinstance(measurement, FrameSet):
-                separate.add(measurement)
-                number += 1
-                if on_frameset is not None and on_frameset(number, separate):
-                    break
-    finally:
-        separate.close()
-    motions, names = separate.motions(), tuple(pair.name for pair in rig.pairs)
-    for name, measured in zip(names, motions, strict=True):
-        if not measured.count:
-            raise CalibrationError(
-                f"{name} measured no motion at all in {number} framesets: does it see texture, are its left and right "
-                "images in this order and not another pair's, and is its own calibration right?"
-            )
-    segments = segments_of_motions(motions)
+    recorded = _track(opened, SeparateMotions(rig, config or Config()), on_frameset)
+    names = tuple(pair.name for pair in rig.pairs)
+    _check_moved(names, recorded)
+    segments = segments_of_motions(recorded.motions)
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
         return calibrate_pair(segments.of_both(one, other), seed, scale_mode=mode)
 
     found, missing = pairwise(names, calibrate, scale_mode)
     extrinsics = place_all(found, names, segments)
-    imu, unchecked = _imu(rig, segments, np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
+    imu, unchecked = _imu(rig, segments, recorded.stamps_ns, recorded.gyro)
     made = Calibration(names, extrinsics, rig, imu)
     return replace(made, warnings=(*extrinsics.warnings, *missing, *rig_warnings(made), *unchecked))
 
@@ -151,6 +132,56 @@ def calibrate_trajectories(
         if clock.drifts
     ]
     return Calibration(tuple(names), extrinsics, clocks=clocks, warnings=(*extrinsics.warnings, *missing, *drifts))
+
+
+class _Recorded(NamedTuple):
+    """What a recording has for the calibration.
+
+    Attributes:
+        framesets: Number of framesets.
+        motions: Of each pair.
+        stamps_ns: (N,) of the IMU samples.
+        gyro: (N, 3) their angular rates, rad/s.
+    """
+
+    framesets: int
+    motions: Sequence[CameraMotions]
+    stamps_ns: Int
+    gyro: Float
+
+
+def _track(source: Source, separate: SeparateMotions, on_frameset: OnFrameset | None) -> _Recorded:
+    """Track every pair by itself through a recording, as long as ``on_frameset`` wants it, and collect the gyro."""
+    stamps_ns: list[int] = []
+    gyro: list[Float] = []
+    framesets = 0
+    try:
+        for measurement in source:
+            if isinstance(measurement, ImuSample):
+                stamps_ns.append(measurement.stamp_ns)
+                gyro.append(measurement.angular_velocity)
+            elif isinstance(measurement, FrameSet):
+                separate.add(measurement)
+                framesets += 1
+                if on_frameset is not None and on_frameset(framesets, separate):
+                    break
+    finally:
+        separate.close()
+    return _Recorded(framesets, separate.motions(), np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
+
+
+def _check_moved(names: Sequence[str], recorded: _Recorded) -> None:
+    """Refuse a recording in which a pair measured nothing.
+
+    Raises:
+        CalibrationError: if that is so.
+    """
+    for name, measured in zip(names, recorded.motions, strict=True):
+        if not measured.count:
+            raise CalibrationError(
+                f"{name} measured no motion at all in {recorded.framesets} framesets: does it see texture, are its "
+                "left and right images in this order and not another pair's, and is its own calibration right?"
+            )
 
 
 def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:
