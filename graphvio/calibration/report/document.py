@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Bool, Float
+from graphvio.calibration.imu_alignment import ImuAlignment
 from graphvio.calibration.pair_calibration import PairCalibration
-from graphvio.calibration.result import Calibration
+from graphvio.calibration.result import Calibration, Clock
 from graphvio.errors import CalibrationError
 
 VERSION = 1
@@ -36,54 +37,16 @@ def document(found: Calibration) -> dict[str, Any]:
         },
         "known": {name: _known(found, j) for j, name in enumerate(found.names) if j},
         "covariance": found.places.covariance.tolist(),
-        "two_at_a_time": [
-            {
-                "first": found.names[i],
-                "second": found.names[j],
-                **_pair(each),
-                **({"squared_distance_of_all": found.places.distances[i, j]} if found.places.distances else {}),
-            }
-            for (i, j), each in found.places.pairwise.items()
-        ],
-        "loops": [
-            {
-                "names": [found.names[k] for k in loop.cameras],
-                "rotation_rad": float(np.linalg.norm(loop.error[:3])),
-                "translation_m": float(np.linalg.norm(loop.error[3:])),
-                "squared_distance": loop.statistic,
-            }
-            for loop in found.places.loops
-        ],
+        "two_at_a_time": [_two(found, i, j) for i, j in found.places.pairwise],
+        "loops": _loops(found),
         "warnings": list(found.warnings),
     }
     if found.rig is not None:
         made["rig_before"] = [_rig_before(found, j) for j in range(1, len(found.names))]
     if found.imu:
-        made["imu"] = [
-            {
-                "name": found.names[j],
-                "body_R_left": each.body_R_left.tolist(),
-                "misrotation_rad": each.misrotation.tolist(),
-                "misrotation_covariance": each.covariance.tolist(),
-                "time_offset_s": each.time_offset_s,
-                "time_offset_sigma_s": each.time_offset_sigma_s,
-                "gyro_bias_rad_s": each.gyro_bias.tolist(),
-            }
-            for j, each in found.imu.items()
-        ]
+        made["imu"] = [_imu(found.names[j], each) for j, each in found.imu.items()]
     if found.clocks:
-        made["clocks"] = [
-            {
-                "first": found.names[i],
-                "second": found.names[j],
-                "offset_ns": clock.relation.offset_ns,
-                "at_ns": clock.relation.at_ns,
-                "offset_sigma_s": clock.offset_sigma_s,
-                "drift": clock.relation.drift,
-                "drift_sigma": clock.drift_sigma,
-            }
-            for (i, j), clock in found.clocks.items()
-        ]
+        made["clocks"] = [_clock(found.names[i], found.names[j], each) for (i, j), each in found.clocks.items()]
     return made
 
 
@@ -104,6 +67,16 @@ def write_document(found: Calibration, path: Path) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def _two(found: Calibration, i: int, j: int) -> dict[str, Any]:
+    distances = found.places.distances
+    return {
+        "first": found.names[i],
+        "second": found.names[j],
+        **_pair(found.places.pairwise[i, j]),
+        **({"squared_distance_of_all": distances[i, j]} if distances else {}),
+    }
 
 
 def _pair(each: PairCalibration) -> dict[str, Any]:
@@ -169,4 +142,40 @@ def _rig_before(found: Calibration, j: int) -> dict[str, Any]:
         "sigmas": rig.sigmas,
         "off": rig.is_off,
         "swapped": rig.is_swapped,
+    }
+
+
+def _loops(found: Calibration) -> list[dict[str, Any]]:
+    return [
+        {
+            "names": [found.names[k] for k in loop.cameras],
+            "rotation_rad": float(np.linalg.norm(loop.error[:3])),
+            "translation_m": float(np.linalg.norm(loop.error[3:])),
+            "squared_distance": loop.statistic,
+        }
+        for loop in found.places.loops
+    ]
+
+
+def _imu(name: str, each: ImuAlignment) -> dict[str, Any]:
+    return {
+        "name": name,
+        "body_R_left": each.body_R_left.tolist(),
+        "misrotation_rad": each.misrotation.tolist(),
+        "misrotation_covariance": each.covariance.tolist(),
+        "time_offset_s": each.time_offset_s,
+        "time_offset_sigma_s": each.time_offset_sigma_s,
+        "gyro_bias_rad_s": each.gyro_bias.tolist(),
+    }
+
+
+def _clock(first: str, second: str, clock: Clock) -> dict[str, Any]:
+    return {
+        "first": first,
+        "second": second,
+        "offset_ns": clock.relation.offset_ns,
+        "at_ns": clock.relation.at_ns,
+        "offset_sigma_s": clock.offset_sigma_s,
+        "drift": clock.relation.drift,
+        "drift_sigma": clock.drift_sigma,
     }
