@@ -42,6 +42,7 @@ from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
+from graphvio.self_calibration.evidence import Evidence
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, has_coefficient, moved_cameras
@@ -498,6 +499,20 @@ def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool,
     part = covariance_of(remaining.equations.hessian, np.arange(len(off)))
     assert np.abs(off / np.sqrt(np.diag(part))).max() < 0.05
     np.testing.assert_allclose(np.sqrt(np.diag(part)), np.sqrt(np.diag(whole)), rtol=1e-3)
+
+
+def test_factors_of_the_rig_file_change_only_for_clearly_likelier_ones() -> None:
+    """3 and 5 are equally likely where extrinsics and IMU are off by 3.8 of the file's standard deviations."""
+    calibration = WindowCalibration(single_rig())
+    prior = calibration._prior
+    information = 1e4 * np.linalg.inv(prior.covariance)
+
+    def factor_by(sigmas: float) -> float:
+        difference = np.linalg.cholesky(prior.covariance) @ np.where(prior.group == 1, sigmas, 0.0)
+        calibration.update(Evidence(information, information @ difference))
+        return float(calibration.factors[1])
+
+    assert [factor_by(sigmas) for sigmas in (3.0, 3.85, 5.0, 3.75, 3.0)] == [3.0, 3.0, 5.0, 5.0, 3.0]
 
 
 def test_first_guess_in_motion_finds_velocity_gravity_and_gyro_bias() -> None:

@@ -24,6 +24,7 @@ from graphvio.self_calibration.prior import file_prior
 _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of intrinsics, and of extrinsics and the IMU
 _MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts of it that nothing has shown yet
 _FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
+_MIN_LOG_GAIN = 4.0  # twice the logarithm of the odds, by which factors change: each change moves the window's poses
 _FAR_OFF = 3.0  # factor of a file whose scale is not to be trusted
 _MAX_SIGMAS = 4.0  # no file is so wrong: the window is
 _WALK = 0.01  # in one second, as a share of the file's standard deviations
@@ -181,7 +182,10 @@ class WindowCalibration:
         if not (self.is_file_exact and self.is_exact(found)):
             # Errors that the tracks of one camera have in common look like those of a lens: it is not as wrong as any.
             of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
-            self.factors = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
+            likeliest = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
+            likelihood = FactorLikelihood(self._evidence, self._prior)
+            if self.is_file_exact or likelihood(likeliest) - likelihood(before) > _MIN_LOG_GAIN:
+                self.factors = likeliest
         return not np.array_equal(self.factors, before)
 
     def note(self, stamp_ns: int, states: States, covariance: StateCovariance) -> None:
