@@ -83,8 +83,8 @@ def _table(figures: Evaluation) -> Table:
         table.add_column(column, justify="right")
     table.add_row("ATE, position", *_stats(figures.ate_position_m, " m"), _percent(figures.ate_percent))
     if figures.ate_scaled_m is not None and figures.scale_error_percent is not None:
-        name = f"ATE, position, with the scale corrected by {-figures.scale_error_percent:+.3f} %"
-        table.add_row(name, f"{figures.ate_scaled_m:.4f} m", "", "", "")
+        table.add_row("ATE, position, scale aligned", f"{figures.ate_scaled_m:.4f} m", "", "", "")
+        table.add_row("scale error", f"{figures.scale_error_percent:+.3f} %", "", "", "")
     table.add_row("ATE, rotation", *_stats(figures.ate_rotation_deg, "°"), "", end_section=True)
     for over, error in figures.rpe.items():
         table.add_row(f"RPE over {over}, position", *_stats(error.position_m, " m"), _percent(error.percent))
