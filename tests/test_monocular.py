@@ -505,7 +505,7 @@ def test_factors_of_the_rig_file_change_only_for_clearly_likelier_ones() -> None
     """3 and 5 are equally likely where extrinsics and IMU are off by 3.8 of the file's standard deviations."""
     calibration = WindowCalibration(single_rig())
     prior = calibration._prior
-    information = 1e4 * np.linalg.inv(prior.covariance)
+    information: Float = 1e4 * np.linalg.inv(prior.covariance).astype(np.float64)
 
     def factor_by(sigmas: float) -> float:
         difference = np.linalg.cholesky(prior.covariance) @ np.where(prior.group == 1, sigmas, 0.0)
