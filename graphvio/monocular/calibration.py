@@ -178,12 +178,12 @@ class WindowCalibration:
             Whether the factors have changed.
         """
         before, self._evidence = self.factors, self._kept.plus(evidence)
-        found, self.log_bayes_factor = self._evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
+        likelihood = FactorLikelihood(self._evidence, self._prior)
+        found, self.log_bayes_factor = self._evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
         if not (self.is_file_exact and self.is_exact(found)):
             # Errors that the tracks of one camera have in common look like those of a lens: it is not as wrong as any.
             of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
             likeliest = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
-            likelihood = FactorLikelihood(self._evidence, self._prior)
             if self.is_file_exact or likelihood(likeliest) - likelihood(before) > _MIN_LOG_GAIN:
                 self.factors = likeliest
         return not np.array_equal(self.factors, before)

@@ -233,8 +233,8 @@ def _tables_of_pairs(report: Report, results: Mapping[Case, CalibrationOutcome])
     report.add(
         "### Accuracy",
         "ATE in cm and ratio to the better single pair: median / worst of the draws. Ratio to the exact files: of the "
-        "medians. But for scale: after alignment with scale, and the scale's error, of both pairs: what is in the ATE "
-        "beside it is the baselines' error, which only the accelerometer may show. Pose NEES: of poses since the first "
+        "medians. But for scale: after alignment with scale, of both pairs, and the error of their scale, which is "
+        "that of the files' baselines where the accelerometer does not show it. Pose NEES: of poses since the first "
         "one, by all pairs, 1 where covariances are right. With pose: framesets of the worst draw, by all pairs.",
     )
     head = [
