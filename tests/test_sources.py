@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import gc
 import logging
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from recordings import (
     FRAME_PERIOD_NS,
     IMU_PERIOD_NS,
@@ -34,6 +40,7 @@ from graphvio import FrameSet, ImuSample, RigError, SourceError, open_source
 from graphvio.rig_files import save_rig
 from graphvio.sources import Source
 from graphvio.sources.read_ahead import read_ahead
+from graphvio.sources.read_ahead_process import can_fork, read_ahead_in_process
 
 S = 10**9
 
@@ -680,6 +687,99 @@ def test_read_ahead_raises_errors_in_order() -> None:
     with pytest.raises(RuntimeError, match="in a thread"):
         next(results)
     assert ended()
+
+
+needs_fork = pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux with two cores only")
+
+
+@needs_fork
+def test_read_ahead_in_process_yields_results_in_order() -> None:
+    def work(item: int) -> tuple[int, NDArray[np.int64]]:
+        return os.getpid(), np.arange(item)
+
+    results = list(read_ahead_in_process(work, range(100), buffer_bytes=8 * 50, depth=4))  # half of them have room
+    assert len({pid for pid, _ in results}) == 1
+    assert results[0][0] != os.getpid()
+    for item, (_, values) in enumerate(results):
+        np.testing.assert_array_equal(values, np.arange(item))
+        values[:] = -1  # which later results must not see, nor change
+
+
+@needs_fork
+def test_read_ahead_in_process_is_bounded(tmp_path: Path) -> None:
+    def work(item: int) -> int:
+        (tmp_path / str(item)).touch()
+        return item
+
+    results = read_ahead_in_process(work, range(100), buffer_bytes=8, depth=4)
+    for expected in range(20):
+        assert next(results) == expected
+        time.sleep(0.002)
+        assert not (tmp_path / str(expected + 1 + 4)).exists()
+    results.close()
+    assert not multiprocessing.active_children()
+
+
+@needs_fork
+def test_read_ahead_in_process_raises_errors_in_order() -> None:
+    def work(item: int) -> int:
+        if item == 3:
+            raise RuntimeError("in a process")
+        return item
+
+    results = read_ahead_in_process(work, range(10), buffer_bytes=8)
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(RuntimeError, match="in a process"):
+        next(results)
+    assert not multiprocessing.active_children()
+
+
+@needs_fork
+def test_read_ahead_in_process_that_is_killed_goes_on_here(caplog: pytest.LogCaptureFixture) -> None:
+    pid = os.getpid()
+
+    def work(item: int) -> int:
+        if item == 3 and os.getpid() != pid:
+            os.kill(os.getpid(), signal.SIGKILL)  # as where memory is short
+        return item
+
+    assert list(read_ahead_in_process(work, range(10), buffer_bytes=8, depth=4)) == list(range(10))
+    assert len(caplog.records) == 1
+    assert ended()
+
+
+@needs_fork
+def test_read_ahead_in_process_ends_with_its_parent() -> None:
+    program = (
+        "import os, signal, time\n"
+        "from graphvio.sources.read_ahead_process import read_ahead_in_process\n"
+        "results = read_ahead_in_process(lambda _: os.getpid(), range(100), buffer_bytes=8, depth=4)\n"
+        "print(next(results), flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    # The output is read to its end, which comes when both processes have ended.
+    killed = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, timeout=60.0, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert int(killed.stdout) > 0
+
+
+@needs_fork
+def test_recording_that_is_decoded_in_a_process_is_the_same(walk: Path) -> None:
+    image_file(walk, 2, 4).unlink()
+    image_file(walk, 1, 6).write_bytes(b"no image")
+    in_threads, in_process = open_source(walk), open_source(walk)
+    in_process.decodes_in_process = True
+    for expected, actual in zip(in_threads, in_process, strict=True):
+        assert actual.stamp_ns == expected.stamp_ns
+        if isinstance(expected, FrameSet):
+            assert isinstance(actual, FrameSet)
+            assert actual.images.keys() == expected.images.keys()
+            for pair, images in expected.images.items():
+                np.testing.assert_array_equal(actual.images[pair], images)
+    assert in_process.faults.counts == in_threads.faults.counts == {"image_missing": 1, "image_undecodable": 1}
+    assert in_process.faults.events == in_threads.faults.events
+    assert len(in_process.decode_ms) == 10
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").is_dir(), reason="the real EuRoC clip is not here")

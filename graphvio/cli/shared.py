@@ -92,7 +92,9 @@ def open_recording(source: Path, rig: Path | None, settings: Config, reading: Re
     from graphvio.rig_files import load_rig
 
     check_scene(source)
-    return reading.open(source, None if rig is None else load_rig(rig), settings.timing.simultaneous_ms)
+    recording = reading.open(source, None if rig is None else load_rig(rig), settings.timing.simultaneous_ms)
+    recording.decodes_in_process = True
+    return recording
 
 
 def reading_of(

@@ -17,9 +17,10 @@ from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Camera, Rig
 from graphvio.sources.coverage import count_image_faults, count_imu_faults
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.index import Index
+from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.matching import TOLERANCE_NS, FramesetIndex, group_pairs, match_sides, of_single
 from graphvio.sources.read_ahead import read_ahead
+from graphvio.sources.read_ahead_process import can_fork, read_ahead_in_process
 from graphvio.sources.sequencer import merge
 from graphvio.sources.tables import ImuTable
 
@@ -50,6 +51,8 @@ class Source:
         end_ns: stamp of the last frameset.
         truth: file, session or bag from which `load_trajectory` reads the true trajectory, or None.
         decode_ms: time that the decoding of each frameset took in its thread, milliseconds.
+        decodes_in_process: whether image files are decoded in a forked process while the recording is iterated, which
+            is faster, rather than in threads. False; for programs that know that they can be forked.
 
     Raises:
         SourceError: if no frameset is left.
@@ -68,6 +71,7 @@ class Source:
         self.truth = index.truth
         self.faults = faults
         self.decode_ms: list[float] = []
+        self.decodes_in_process = False
         self._images, self._masks = index.images, index.masks
         self._fit_cameras: set[str] = set()
         stamps_ns = {name: images.stamps_ns for name, images in index.images.items()}
@@ -125,7 +129,7 @@ class Source:
 
     def _read_framesets(self) -> Generator[FrameSet, None, None]:
         is_empty = True
-        with closing(read_ahead(self._decode, range(self.frameset_count))) as decoded:
+        with closing(self._decoded()) as decoded:
             for item in decoded:
                 self.decode_ms.append(item.decode_ms)
                 for kind, detail in item.faults:
@@ -145,6 +149,15 @@ class Source:
                 f"{self.name}: none of its {self.frameset_count} framesets could be read ({self.faults}); "
                 f"{self.faults.events[0].detail}"
             )
+
+    def _decoded(self) -> Generator[_Decoded, None, None]:
+        """Decode all framesets ahead of their use."""
+        numbers = range(self.frameset_count)
+        sequences = [*self._images.values(), *self._masks.values()]
+        if self.decodes_in_process and can_fork() and all(isinstance(each, ImageFiles) for each in sequences):
+            pixels = sum(width * height for width, height in (camera.size_px for camera in self.rig.cameras))
+            return read_ahead_in_process(self._decode, numbers, pixels * (2 if self._masks else 1))
+        return read_ahead(self._decode, numbers)
 
     def _decode(self, at: int) -> _Decoded:
         begun = time.perf_counter()
