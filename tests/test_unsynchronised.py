@@ -17,6 +17,7 @@ from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_sourc
 from graphvio.config import Config
 from graphvio.errors import SourceError
 from graphvio.evaluation import evaluate
+from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.sensors import Measurement
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
@@ -252,11 +253,13 @@ def test_pairs_of_one_instant_that_come_separately_are_joined_while_held(
 
 
 @cache
-def walk(rates: float | tuple[float, ...], offset_ms: float) -> tuple[Rig, list[FrameSet], list[ImuSample], Trajectory]:
+def walk(
+    rates: float | tuple[float, ...], offset_ms: float, duration_s: float = DURATION_S
+) -> tuple[Rig, list[FrameSet], list[ImuSample], Trajectory]:
     def write(folder: Path) -> None:
-        write_recording(small_simulator(rates, offset_ms), folder)
+        write_recording(small_simulator(rates, offset_ms, duration_s), folder)
 
-    source = open_source(rendered_once("unsynchronised", write, rates, offset_ms, DURATION_S))
+    source = open_source(rendered_once("unsynchronised", write, rates, offset_ms, duration_s))
     assert source.truth is not None
     measurements = list(source)
     framesets = [each for each in measurements if isinstance(each, FrameSet)]
@@ -323,3 +326,60 @@ def test_a_late_pair_at_a_low_rate_breaks_nothing_without_an_imu() -> None:
     assert {e.epoch for e in estimates} == {0}
     assert all(e.nav_T_body is not None for e in estimates[2:])
     assert error < 0.010
+
+
+# ------------------------------------------------------------------ clocks that differ
+
+CLOCKS_S = 7.0
+CORRECTED_S = 4.0  # the walk has turned for two seconds by then
+
+
+@cache
+def run_with_late_stamps(late_ms: float) -> tuple[Odometry, list[Estimate], list[Event], Trajectory]:
+    """The second pair, 17 ms after the first, has stamps that are late, by its clock or its way to the computer."""
+    rig, framesets, samples, truth = walk(20.0, 17.0, CLOCKS_S)
+    late = [
+        FrameSet(each.stamp_ns + round(late_ms * MS), each.images) if 1 in each.images else each for each in framesets
+    ]
+    late.sort(key=lambda each: each.stamp_ns)
+    odometry = Odometry(rig, CONFIG)
+    estimates = [e for m in merge(samples, late) if (e := odometry.process(m)) is not None]
+    estimates += odometry.finish()
+    return odometry, estimates, odometry.take_events(), truth
+
+
+def corrected(estimates: Sequence[Estimate]) -> list[Estimate]:
+    return [e for e in estimates if e.stamp_ns - estimates[0].stamp_ns > CORRECTED_S * 1e9]
+
+
+def rmse_of(estimates: Sequence[Estimate], truth: Trajectory) -> float:
+    posed = [e for e in estimates if e.nav_T_body is not None]
+    made = Trajectory(np.array([e.stamp_ns for e in posed]), np.array([e.nav_T_body for e in posed]))
+    return evaluate(made, truth).ate_position_m.rmse
+
+
+@pytest.mark.parametrize("late_ms", [-8.0, 15.0])
+def test_late_stamps_of_a_pair_are_found_and_corrected(late_ms: float) -> None:
+    """From then on all motions are used, and poses are those at the stamps, as right as with right stamps."""
+    odometry, estimates, events, truth = run_with_late_stamps(late_ms)
+    (event,) = [each for each in events if each.kind == EventKind.TIME_OFFSET_OFF]
+    assert event.stamp_ns - estimates[0].stamp_ns < CORRECTED_S * 1e9
+    assert any("back" in warning for warning in odometry.rig_warnings)
+    assert all(e.status is Status.TRACKING for e in corrected(estimates))
+    assert rmse_of(corrected(estimates), truth) < rmse_of(corrected(run_with_late_stamps(0.0)[1]), truth) + 0.001
+
+
+def test_right_stamps_are_left_alone() -> None:
+    odometry, estimates, events, _ = run_with_late_stamps(0.0)
+    assert odometry.rig_warnings == []
+    assert not [each for each in events if each.kind == EventKind.TIME_OFFSET_OFF]
+    assert all(e.status is Status.TRACKING for e in estimates[2:])
+
+
+def test_final_poses_of_late_stamps_are_those_at_the_stamps() -> None:
+    odometry, estimates, _, truth = run_with_late_stamps(15.0)
+    final = dict(odometry.take_smoothed())
+    assert sorted(final) == [e.stamp_ns for e in estimates if e.nav_T_body is not None]
+    of_late = [e.stamp_ns for e in corrected(estimates) if 1 in e.pairs]
+    poses = Trajectory(np.array(of_late), np.array([final[stamp_ns] for stamp_ns in of_late]))
+    assert evaluate(poses, truth).ate_position_m.rmse < 0.002

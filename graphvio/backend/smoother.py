@@ -66,6 +66,7 @@ class Smoother:
         self._index_of: dict[int, int] = {}
         self._views = ReferenceViews()
         self._previous_motion = np.zeros(6)  # tangent per second
+        self._step_s = 0.0  # between the two newest states
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._seen_ns: int | None = None  # the same, by vision
         self._nav_covariance = np.zeros((6, 6))  # of nav itself, left of its poses: reported, but not estimated
@@ -102,7 +103,8 @@ class Smoother:
     def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
         """Predict the next state and append it: by the IMU, or without an interval of it by constant velocity."""
         i = self._index_of[self.latest_ns]
-        dt = (stamp_ns - self.latest_ns) * 1e-9
+        # Stamps of two cameras' clocks may be farther apart, or less, than their images.
+        dt = self._step_s = 1e-9 * (stamp_ns - self.latest_ns if interval is None else interval.duration_ns)
         before = self.state()
         if interval is None or self._imu is None or self._params is None:
             motion = se3_exp(self._previous_motion * dt)
@@ -220,7 +222,7 @@ class Smoother:
         """
         if len(self._stamps) < 2 or self._seen_ns != self._stamps[-2]:
             return None
-        before, dt = self.pose(self._stamps[-2]), (self._stamps[-1] - self._stamps[-2]) * 1e-9
+        before, dt = self.pose(self._stamps[-2]), self._step_s
         measured = self.pose(motion.reference_stamp_ns) @ motion.reference_T_current
         velocity = before[:3, :3] @ self._previous_motion[3:]  # mean of the step before
         accel = (measured[:3, 3] - before[:3, 3] - velocity * dt) / dt**2
@@ -287,9 +289,8 @@ class Smoother:
             self._window.optimize(followed)
         self._advanced = self._advanced + 1 if advanced else 0
         if len(self._stamps) > 1:
-            dt = (self._stamps[-1] - self._stamps[-2]) * 1e-9
             step = se3_inverse(self.pose(self._stamps[-2])) @ self.pose(self._stamps[-1])
-            self._previous_motion = se3_log(step) / dt
+            self._previous_motion = se3_log(step) / self._step_s
         return [] if advanced else self._forget(self.latest_ns - round(self._config.lag_s * 1e9), keep)
 
     def optimize(self) -> None:

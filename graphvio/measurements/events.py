@@ -90,7 +90,8 @@ class EventKind(StrEnum):
     NOT_INITIALISED = "not_initialised"
     """Some seconds after a start in motion, attitude or velocity are still uncertain; go on moving."""
     TIME_OFFSET_OFF = "time_offset_off"
-    """Rotations of vision and gyro contradict the rig's time offset; it is corrected for this run."""
+    """Rotations by vision and gyro contradict the rig's time offset, or the stamps of a pair that is triggered by
+    itself; it is corrected for this run."""
 
     # ---------------------------------------------------------------- SLAM
     CORRECTION_REFUSED = "correction_refused"

@@ -29,6 +29,11 @@ class ImuInterval:
     stamp_sigma_s: float = 0.0
 
     @property
+    def duration_ns(self) -> int:
+        """Time between the two instants, nanoseconds."""
+        return round(1e9 * float(self.steps_s.sum()))
+
+    @property
     def mean_rate(self) -> Float:
         """Mean angular rate (3,) rad/s, bias included."""
         return np.asarray(self.steps_s @ self.angular_velocity / self.steps_s.sum())

@@ -101,6 +101,18 @@ def with_state(
     )
 
 
+def at_stamp(estimate: Estimate, body_T_stamped: Float) -> Estimate:
+    """Return an estimate with the pose at its stamp, where that is not the instant of its images.
+
+    Args:
+        estimate: With the state at the instant of the images.
+        body_T_stamped: (4, 4) motion of body from then until the stamp.
+    """
+    if estimate.nav_T_body is None:
+        return estimate
+    return replace(estimate, nav_T_body=estimate.nav_T_body @ body_T_stamped)
+
+
 def keyframe_of(
     frameset: FrameSet, frontend: VisualFrontend, estimator: StateEstimator, nav: NavFrame, previous_ns: int | None
 ) -> NewKeyframe:

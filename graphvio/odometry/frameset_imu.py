@@ -152,7 +152,7 @@ class FramesetImu:
         """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""
         if not self._readout_ns or not self._estimator.has_imu or self.is_left_out:
             return None
-        interval = self._synchroniser.interval(stamp_ns, stamp_ns + self._readout_ns)
+        interval = self._synchroniser.interval_after(stamp_ns, self._readout_ns)
         if interval is None:
             return None
         if not self._estimator.has_pose:

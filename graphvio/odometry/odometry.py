@@ -29,9 +29,16 @@ from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, cali
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
-from graphvio.odometry.assembly import estimate_by_measurements, estimate_without_pose, keyframe_of, with_state
+from graphvio.odometry.assembly import (
+    at_stamp,
+    estimate_by_measurements,
+    estimate_without_pose,
+    keyframe_of,
+    with_state,
+)
 from graphvio.odometry.fixed_calibration import FixedCalibration
 from graphvio.odometry.frameset_imu import FramesetImu
+from graphvio.odometry.group_clocks import GroupClocks
 from graphvio.odometry.imu_clock import with_late_clock
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
@@ -115,6 +122,7 @@ class Odometry:
         self._imu = FramesetImu(rig, self.config, self._synchroniser, self._estimator, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
+        self._clocks = GroupClocks(rig, self.config, self._synchroniser, self.report)
         self._calibration = self._new_calibration()
         self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
@@ -227,13 +235,16 @@ class Odometry:
 
     def take_smoothed(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` that became final since the last call, not always in time order."""
-        return [(stamp_ns, self._nav.pose(stamp_ns, pose)) for stamp_ns, pose in self._estimator.take_final()]
+        return [
+            (stamp_ns, self._nav.pose(stamp_ns, self._clocks.final_at_stamp(stamp_ns, pose)))
+            for stamp_ns, pose in self._estimator.take_final()
+        ]
 
     @property
     def rig_warnings(self) -> list[str]:
         """Where the measurements contradict the rig: a sentence each, with the size and what is done about it."""
         off = [f"{finding}; corrected for this run" for finding in self.calibration_findings if finding.is_significant]
-        return self._vision_events.rig_warnings + off + self._imu.warnings
+        return self._vision_events.rig_warnings + off + self._imu.warnings + self._clocks.warnings
 
     @property
     def calibration(self) -> CalibrationEstimate | None:
@@ -322,7 +333,7 @@ class Odometry:
         is_stationary = visual.is_stationary and self._imu.shows_standstill(predicted.interval)
         applied = self._gate(visual, is_stationary)
         status = self._update(predicted, applied)
-        self._watch_imu(predicted, visual, applied)
+        self._watch_clocks(frameset, predicted, visual, applied)
         self._recalibrate(frameset.stamp_ns, visual, status)
         self._restart_prediction(frameset.stamp_ns, status)
         if not self._estimator.has_pose:
@@ -379,10 +390,15 @@ class Odometry:
         return update.status
 
     @timed("update")
-    def _watch_imu(self, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate) -> None:
-        """Leave the IMU out while it contradicts vision, and let the time offset follow."""
+    def _watch_clocks(
+        self, frameset: FrameSet, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate
+    ) -> None:
+        """Leave the IMU out while it contradicts vision, and let the time offsets follow."""
         stamp_ns = predicted.stamp_ns
-        if self._imu.watch(stamp_ns, predicted.interval, visual, applied.motion):
+        is_imu_changed = self._imu.watch(stamp_ns, predicted.interval, visual, applied.motion)
+        if is_imu_changed:
+            self._clocks.restart()
+        if self._clocks.update(frameset, visual) or is_imu_changed:
             self._frontend.start_keyframe()
             self._calibration.restart_imu()
         self._synchroniser.forget_before(stamp_ns)
@@ -411,6 +427,8 @@ class Odometry:
             frameset.stamp_ns, status, visual, is_stationary, rates, self._time_offset, self.stage_ms
         )
         estimate = with_state(measured, estimator, self._calibration, self._nav)
+        to_stamp = self._clocks.motion_to_stamp(frameset.stamp_ns, estimator.state(), estimator.latest_rate())
+        estimate = estimate if to_stamp is None else at_stamp(estimate, to_stamp)
         references, keyframe = self._frontend.reference_stamps_ns, None
         if frameset.stamp_ns in references:
             keyframe = keyframe_of(frameset, self._frontend, estimator, self._nav, self._keyframe_ns)
@@ -442,7 +460,7 @@ class Odometry:
         has_imu = estimator.has_imu and not self._imu.is_left_out
         samples = self._synchroniser.samples_since(stamp_ns) if has_imu else NO_SAMPLES
         self._propagator.restart(
-            stamp_ns,
+            self._synchroniser.instant_ns(stamp_ns),
             self._nav.state(estimator.state()),
             estimator.epoch,
             np.zeros(3) if rate is None else rate,

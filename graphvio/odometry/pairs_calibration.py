@@ -124,7 +124,8 @@ class PairsCalibration:
         tolerant = self._imu_fault_tolerant
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)
-        calibration.add_frameset(stamp_ns, pose, views, quality is Quality.WEAK, is_urgent)
+        instant_ns = self._synchroniser.instant_ns(stamp_ns)
+        calibration.add_frameset(instant_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:
         """Give cameras to the front-end, and the IMU's scale, axes and time offset to the synchroniser."""

@@ -52,7 +52,11 @@ class Synchroniser:
         self._pairs = len(rig.groups)
         self._has_imu = rig.imu is not None
         self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
+        self._nominal_ns = self._offset_ns
         self._clock_ns = 0  # by which the IMU's stamps are taken to be earlier than they come
+        self._lateness_ns: dict[int, int] = {}  # by group
+        self._instants_ns: dict[int, int] = {}  # of framesets whose stamps are late, by stamp
+        self._newest_instant_ns: int | None = None
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._timing = config.timing
         self._initialisation = config.initialisation
@@ -147,8 +151,27 @@ class Synchroniser:
 
     def _taken(self) -> FrameSet:
         frameset = self._held.popleft()
-        self._jitter.add(frameset.stamp_ns, min(frameset.images, default=0))
+        stamp_ns, instant_ns = frameset.stamp_ns, self._expected_instant_ns(frameset)
+        if self._newest_instant_ns is not None:  # framesets stay in the order of their stamps
+            instant_ns = max(instant_ns, self._newest_instant_ns + _MIN_INTERVAL_NS)
+        self._newest_instant_ns = instant_ns
+        if instant_ns != stamp_ns:
+            self._instants_ns[stamp_ns] = instant_ns
+        self._jitter.add(stamp_ns, min(frameset.images, default=0))
         return frameset
+
+    def _expected_instant_ns(self, frameset: FrameSet) -> int:
+        """Return when the images of a frameset were taken, by the stamps of the first group."""
+        group = next(iter(frameset.images)) if len(frameset.images) == 1 else -1
+        return frameset.stamp_ns - self._lateness_ns.get(group, 0)
+
+    def set_lateness(self, group: int, seconds: float) -> None:
+        """Take the stamps of a group's own framesets to be so late, of those that are taken from now on."""
+        self._lateness_ns[group] = round(seconds * 1e9)
+
+    def instant_ns(self, stamp_ns: int) -> int:
+        """Return when the images of a frameset were taken: its stamp, but for what `set_lateness` has corrected."""
+        return self._instants_ns.get(stamp_ns, stamp_ns)
 
     def finish(self) -> None:
         """Leave out what was not confirmed, as no measurement follows."""
@@ -156,15 +179,28 @@ class Synchroniser:
         self._frameset_jumps.end()
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two framesets' stamps, or None where it does not cover them."""
-        interval = self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
+        """Return the IMU between two framesets, by their stamps, or None where it does not cover them."""
+        return self._interval(self.instant_ns(start_ns) + self._offset_ns, self.instant_ns(end_ns) + self._offset_ns)
+
+    def interval_after(self, stamp_ns: int, duration_ns: int) -> ImuInterval | None:
+        """Return the IMU from a frameset on, or None where it does not cover it."""
+        start_ns = self.instant_ns(stamp_ns) + self._offset_ns
+        return self._interval(start_ns, start_ns + duration_ns)
+
+    def nominal_interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
+        """Return the IMU between two stamps by the rig's time offset, whatever has been found of the clocks."""
+        return self._interval(start_ns + self._nominal_ns, end_ns + self._nominal_ns)
+
+    def _interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
+        """Return the corrected IMU between two of its stamps, or None where it does not cover them."""
+        interval = self._imu.interval(start_ns, end_ns)
         if interval is None:
             return None
         return self.imu_correction.applied_to(replace(interval, stamp_sigma_s=self.stamp_sigma_s))
 
     def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
         """Return the IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
-        stamps, values = self._imu.since(stamp_ns + self._offset_ns)
+        stamps, values = self._imu.since(self.instant_ns(stamp_ns) + self._offset_ns)
         return stamps - self._offset_ns, self.imu_correction.applied(values)
 
     def initial_interval(self, stamp_ns: int) -> tuple[ImuInterval, float] | None:
@@ -172,7 +208,7 @@ class Synchroniser:
 
         What came beyond that is left out, so that the result does not depend on how early samples come.
         """
-        at_ns = stamp_ns + self._offset_ns
+        at_ns = self.instant_ns(stamp_ns) + self._offset_ns
         window_ns, min_ns = (round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s))
         if not self._has_imu or not self._imu.covers(at_ns):
             return None
@@ -226,6 +262,7 @@ class Synchroniser:
         """Drop samples that are older than an initialisation at this frameset's stamp would need."""
         kept_ns = max(round(self._initialisation.window_s * 1e9), _KEPT_NS)
         self._imu.discard_before(stamp_ns + self._offset_ns - kept_ns)
+        self._instants_ns = {ns: at for ns, at in self._instants_ns.items() if ns > stamp_ns - kept_ns}
 
     def _is_due(self, frameset: FrameSet, initialised: bool) -> bool:
         if not self._has_imu or self._imu.oldest_ns is None:
@@ -237,7 +274,7 @@ class Synchroniser:
                 return True
             enough = self.initial_interval(frameset.stamp_ns) is not None
             return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
-        at_ns, newest_ns = frameset.stamp_ns + self._offset_ns, self._imu.newest_ns
+        at_ns, newest_ns = self._expected_instant_ns(frameset) + self._offset_ns, self._imu.newest_ns
         if newest_ns is None or newest_ns >= at_ns + self._readout_ns:
             return True
         longest_ns = self._timing.max_imu_wait_ms * 1e6
