@@ -6,6 +6,7 @@ import gc
 import logging
 import multiprocessing
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -749,18 +750,53 @@ def test_read_ahead_in_process_that_is_killed_goes_on_here(caplog: pytest.LogCap
 
 
 @needs_fork
-def test_read_ahead_in_process_ends_with_its_parent() -> None:
+@pytest.mark.parametrize("work_s", [0.0, 0.5], ids=["waiting", "working"])
+def test_read_ahead_in_process_ends_with_its_parent(work_s: float) -> None:
     program = (
         "import os, signal, time\n"
         "from graphvio.sources.read_ahead_process import read_ahead_in_process\n"
-        "results = read_ahead_in_process(lambda _: os.getpid(), range(100), buffer_bytes=8, depth=4)\n"
-        "print(next(results), flush=True)\n"
+        f"results = read_ahead_in_process(lambda k: time.sleep(k and {work_s}), range(100), buffer_bytes=8, depth=4)\n"
+        "next(results)\n"
+        "time.sleep(0.1)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     # The output is read to its end, which comes when both processes have ended.
-    killed = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, timeout=60.0, check=False)
-    assert killed.returncode == -signal.SIGKILL
-    assert int(killed.stdout) > 0
+    killed = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=60.0, check=False
+    )
+    assert (killed.returncode, killed.stdout) == (-signal.SIGKILL, b"")
+
+
+@needs_fork
+def test_read_ahead_in_process_that_cannot_be_started_goes_on_here(caplog: pytest.LogCaptureFixture) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    results = read_ahead_in_process(lambda item: item, range(10), buffer_bytes=8, depth=4)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+    try:
+        assert next(results) == 0
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert list(results) == list(range(1, 10))
+    assert len(caplog.records) == 1
+    assert ended()
+
+
+@needs_fork
+def test_ctrl_c_while_a_process_is_forked_is_not_lost() -> None:
+    """Python prints and drops exceptions of functions that it calls before a fork."""
+    program = (
+        "import os, signal\n"
+        "from graphvio.sources.read_ahead_process import read_ahead_in_process\n"
+        "os.register_at_fork(before=lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "try:\n"
+        "    next(read_ahead_in_process(lambda item: item, range(10), buffer_bytes=8))\n"
+        "except KeyboardInterrupt:\n"
+        "    print('interrupted')\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=60.0, check=False
+    )
+    assert (ran.returncode, ran.stdout) == (0, b"interrupted\n")
 
 
 @needs_fork

@@ -13,6 +13,7 @@ import mmap
 import multiprocessing
 import os
 import pickle
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Generator, Sequence
@@ -20,7 +21,7 @@ from contextlib import closing, suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from graphvio.runtime import ignore_interrupts
+from graphvio.runtime import HeldInterrupt, ignore_interrupts
 from graphvio.sources.read_ahead import read_ahead
 
 T = TypeVar("T")
@@ -41,9 +42,9 @@ def read_ahead_in_process(
 ) -> Generator[R, None, None]:
     """Yield ``map(work, items)``, with results prepared ahead in a forked process; only where `can_fork`.
 
-    Where the process ends early, threads of this one go on from the result that is due, as `read_ahead` does. An
-    exception of ``work`` ends it, and is raised here. The process ends when the iterator is exhausted, closed or
-    collected, and with this process at the latest.
+    Where the process cannot be started or ends early, threads of this one go on from the result that is due, as
+    `read_ahead` does. An exception of ``work`` ends it, and is raised here. The process ends when the iterator is
+    exhausted, closed or collected, and with this process at the latest.
 
     Args:
         work: called in the process. Files and locks of other threads are not to be used in it.
@@ -51,12 +52,16 @@ def read_ahead_in_process(
         buffer_bytes: room for the arrays of a result. Those of larger ones take longer.
         depth: how many results may wait.
     """
-    process = _Process(work, items, buffer_bytes, depth)
     done = 0
-    with closing(process):
-        while done < len(items) and (results := process.take()):
-            yield results[0]
-            done += 1
+    try:
+        process = _Process(work, items, buffer_bytes, depth)
+    except OSError as error:
+        _log.warning("no process can be started to read ahead (%s): reading goes on in threads, more slowly", error)
+    else:
+        with closing(process):
+            while done < len(items) and (results := process.take()):
+                yield results[0]
+                done += 1
     if done < len(items):
         with closing(read_ahead(work, items[done:], depth)) as remaining:
             yield from remaining
@@ -77,11 +82,12 @@ class _Process:
             _serve(work, items, self._slots, results, freed)
 
         self._process = context.Process(target=serve, name="graphvio-read", daemon=True)
-        with warnings.catch_warnings():
+        with HeldInterrupt() as interrupt, warnings.catch_warnings():  # Python drops errors while it forks
             warnings.simplefilter("ignore", DeprecationWarning)  # of locks that threads hold: there is a timeout
             self._process.start()
         results.close()
         freed.close()
+        interrupt.check()
 
     def take(self) -> list[Any]:
         """Wait for the next result; returns a list with it, or an empty one if none will come."""
@@ -147,17 +153,15 @@ class _Slots:
 def _serve(work: Callable[[T], Any], items: Sequence[T], slots: _Slots, results: Connection, freed: Connection) -> None:
     """Send the results of all items to the parent; None in place of one that cannot be had here."""
     ignore_interrupts()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(_NICENESS)
-    for number, item in enumerate(items):
-        try:
+    with suppress(EOFError, BrokenPipeError):  # the parent has ended
+        for number, item in enumerate(items):
             if number >= slots.depth:
                 freed.recv_bytes()
-        except EOFError:
-            return
-        try:
-            message = slots.store(work(item))
-        except Exception:  # the parent meets it again, and raises it
-            message = None
-        results.send(message)
-        if message is None:
-            return
+            try:
+                message = slots.store(work(item))
+            except Exception:  # the parent meets it again, and raises it
+                results.send(None)
+                return
+            results.send(message)
