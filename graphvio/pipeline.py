@@ -152,13 +152,14 @@ class _Run:
 
     def _finished(self, wall_s: float) -> FinishedRun:
         """Return what is known at the end of the run, which has taken a time."""
+        framesets = self._framesets + self._source.faults.counts.get(EventKind.FRAMESET_EMPTY, 0)
         return FinishedRun(
             wall_s=wall_s,
             frameset_ms=self._frameset_ms,
             smoothed=sorted(self._smoothed, key=lambda stamped: stamped[0]),
             input_faults=self._source.faults.counts,
-            framesets=self._framesets,
-            awaited=self._framesets - self._before_start,
+            framesets=framesets,
+            awaited=framesets - self._before_start,
             resets=self._resets,
             warnings=self._odometry.rig_warnings,
             calibration=described(self._odometry.calibration_findings),

@@ -127,6 +127,8 @@ class _ProgressLine(TerminalDisplay):
 
 
 def _print_summary(summary: Summary, folder: Path) -> None:
+    from graphvio.measurements.events import CORRECTED
+
     evaluation = summary.evaluation
     refined = folder / "rig-refined.yaml"
     remedy = f"{refined} has it" if refined.exists() else "graphvio calibrate --what all finds by how much"
@@ -140,13 +142,15 @@ def _print_summary(summary: Summary, folder: Path) -> None:
             f"against the recording's truth: ATE rmse {1e3 * evaluation['ate_position_m']['rmse']:.1f} mm"
             + (f", drift {drift:.2f} % of the path" if drift is not None else "")
         )
+    if summary.evaluation_error is not None:
+        warn(f"not compared with the recording's truth: {summary.evaluation_error}")
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary.input_faults.items()))
     if faults:
         typer.echo(f"faults of the recording: {faults}")
     for sentence in summary.calibration:
         typer.echo(sentence)
     for warning in summary.warnings:
-        warn(f"{warning}; {remedy}")
+        warn(f"{warning}; {remedy}" if warning.endswith(CORRECTED) else warning)
     doubtful = sum(summary.events.get(kind, 0) for kind in _DOUBTFUL)
     if doubtful > _MAX_DOUBTFUL_SHARE * summary.framesets:
         warn(

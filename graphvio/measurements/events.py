@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
+CORRECTED = "corrected for this run"
+"""Ends sentences about errors of the rig file that the run's results, ``rig-refined.yaml`` among them, do not have."""
+
 
 class EventKind(StrEnum):
     """Kinds of events; the sentence after each says what happened and what is done about it."""
@@ -53,6 +56,8 @@ class EventKind(StrEnum):
     """A motion is uncertain beyond what its residuals show; its covariance is enlarged."""
     CAMERA_FROZEN = "camera_frozen"
     """A camera repeats its image while others do not; its pair is left out until the image changes."""
+    PAIR_UNUSED = "pair_unused"
+    """A stereo pair takes part in no motion for 5 s, while other cameras do; check its images and its calibration."""
     CALIBRATION_CORRECTED = "calibration_corrected"
     """A part of the rig file is wrong beyond 5 sigma by two windows of keyframes; it is corrected from now on."""
     CALIBRATION_CHANGED = "calibration_changed"

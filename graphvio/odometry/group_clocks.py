@@ -105,7 +105,7 @@ class GroupClocks:
             late = f"{1e3 * abs(late_s):.1f} ms {'later' if late_s > 0.0 else 'earlier'}"
             self._warnings[group] = (
                 f"{self._names[group]}: its stamps are {late} than those of {self._names[first]} "
-                f"(sigma {1e3 * sigma_s:.1f} ms); corrected for this run"
+                f"(sigma {1e3 * sigma_s:.1f} ms), which this run allows for; correct them at their source"
             )
             self._report(stamp_ns, EventKind.TIME_OFFSET_OFF, self._warnings[group])
         change_s = late_s - self._late_s.get(group, 0.0)

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from graphvio.errors import RigError
-from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.events import CORRECTED, EventKind, Report
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
@@ -82,6 +82,4 @@ class ImuClock:
 
     @property
     def _what_is_done(self) -> str:
-        return (
-            "it is not used, since framesets do not wait for so long" if self.is_too_late else "corrected for this run"
-        )
+        return "it is not used, since framesets do not wait for so long" if self.is_too_late else CORRECTED

@@ -22,7 +22,7 @@ from graphvio.frontend.images import ImageMask
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
-from graphvio.measurements.events import Event
+from graphvio.measurements.events import CORRECTED, Event
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
@@ -243,7 +243,7 @@ class Odometry:
     @property
     def rig_warnings(self) -> list[str]:
         """Where the measurements contradict the rig: a sentence each, with the size and what is done about it."""
-        off = [f"{finding}; corrected for this run" for finding in self.calibration_findings if finding.is_significant]
+        off = [f"{finding}; {CORRECTED}" for finding in self.calibration_findings if finding.is_significant]
         return self._vision_events.rig_warnings + off + self._imu.warnings + self._clocks.warnings
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import so3_log
 from graphvio.measurements.estimate import Status
-from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.events import CORRECTED, EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
@@ -81,8 +82,9 @@ class PairsCalibration:
 
     @property
     def findings(self) -> list[Finding]:
-        """What is known of each part of the calibration."""
-        return self._calibration.findings()
+        """What is known of each part of the calibration; nothing is significant before a second window confirms it."""
+        found = self._calibration.findings()
+        return found if self._calibration.is_confirmed else [replace(each, is_significant=False) for each in found]
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Register a function that gets each window before it is adjusted for the last time."""
@@ -186,7 +188,7 @@ class PairsCalibration:
 
     def _report_findings(self, stamp_ns: int) -> None:
         """Report once that the rig file is wrong beyond 5 sigma, and each pair that is not where the file has it."""
-        found = self.findings
+        found = self._calibration.findings()
         wrong = contradiction(found)
         if wrong is not None and self._calibration.is_confirmed and not self._is_reported:
             self._is_reported = True
@@ -195,7 +197,7 @@ class PairsCalibration:
             pair, _, kind = finding.part.partition(", ")
             if finding.is_significant and " against " in kind and pair not in self._reported:
                 self._reported.add(pair)
-                self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; corrected for this run")
+                self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; {CORRECTED}")
 
     def _epipolar_margin_px(self) -> float:
         """Return by how much epipolar lines may be off: by the rig file's errors until these are estimated."""

@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -80,15 +80,16 @@ def optimize_sessions(
     """
     sessions = _sessions(sources)
     stages = Stages(sessions, Path(out), config, with_loops=with_loops, calibrates=calibrates, on_progress=on_progress)
-    if stages.calibrates_first:
+    with stages.locked():
+        if stages.calibrates_first:
+            for number in range(len(sessions)):
+                stages.calibrate(number)
+        records = []
         for number in range(len(sessions)):
-            stages.calibrate(number)
-    records = []
-    for number in range(len(sessions)):
-        records.append(stages.record(number, with_features=with_loops))
-        if with_loops:
-            stages.features(number, records[-1])
-    return stages.result(records, stages.closures(records) if with_loops else None)
+            records.append(stages.record(number, with_features=with_loops))
+            if with_loops:
+                stages.features(number, records[-1])
+        return stages.result(records, stages.closures(records) if with_loops else None)
 
 
 def _sessions(sources: Sequence[Source]) -> list[Session]:
@@ -138,6 +139,10 @@ class Stages:
         }
         self._space = Workspace(out, self.inputs)
         self._rigs = [each.source.rig for each in sessions]
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from continuing in the folder, see `Workspace.locked`."""
+        return self._space.locked()
 
     def calibrate(self, number: int) -> None:
         """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from graphvio.errors import OptimizationError
@@ -42,6 +45,27 @@ class Workspace:
             raise _cannot_write(folder, error) from None
         except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
             raise OptimizationError(f"{state}: is damaged; remove the folder or choose another one") from None
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from continuing in the folder.
+
+        Raises:
+            OptimizationError: if another process does so.
+        """
+        descriptor = os.open(self.folder, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OptimizationError(
+                    f"{self.folder}: another run writes into it; wait for its end, or choose another folder"
+                ) from None
+            except OSError:
+                pass  # a file system without locks
+            yield
+        finally:
+            os.close(descriptor)
 
     def has_finished(self, stage: str) -> bool:
         """Whether a stage was finished, in this run or an earlier one, and its files exist."""

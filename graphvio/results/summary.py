@@ -47,7 +47,7 @@ class Summary:
     """The contents of ``summary.json``.
 
     Attributes:
-        framesets: number of framesets read.
+        framesets: number of framesets of the recording, with those of which no image could be read.
         estimated: number of estimates with a pose.
         completion: share of the framesets since the IMU's first sample that have a pose.
         duration_s: from the first to the last estimate, with or without a pose.

@@ -105,7 +105,7 @@ def described(found: list[Finding]) -> list[str]:
     if wrong:
         sentences = [f"calibration corrected: {'; '.join(wrong)}"]
     elif any(np.any(finding.difference) for finding in found):
-        sentences = ["calibration refined: it differs from the rig file, in no part by 5 sigma"]
+        sentences = ["calibration refined: it differs from the rig file, in no part beyond doubt"]
     else:
         sentences = ["calibration: as in the rig file"]
     n_hidden = sum(not finding.is_observed for finding in found)

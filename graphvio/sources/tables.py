@@ -144,7 +144,9 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
 
 def _refuse_other_units(stamps_ns: Int, path: Path) -> None:
     """Refuse stamps of a whole table that can only be in seconds, milliseconds or microseconds."""
-    if len(stamps_ns) >= _MIN_ROWS and (period_ns := float(np.median(np.diff(stamps_ns)))) < _MIN_PERIOD_NS:
+    steps_ns = np.diff(stamps_ns)
+    steps_ns = steps_ns[steps_ns != 0]  # rows that are there twice are counted later
+    if len(steps_ns) >= _MIN_ROWS - 1 and (period_ns := float(np.median(steps_ns))) < _MIN_PERIOD_NS:
         if period_ns < 0.0:
             raise SourceError(f"{path}: stamps decrease from row to row; sort the rows by their stamps")
         raise SourceError(

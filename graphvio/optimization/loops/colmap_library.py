@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from typing import Any
 
 from graphvio.errors import MissingExtraError, OptimizationError
@@ -24,5 +26,7 @@ def colmap() -> Any:
         raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
     if has_mixed_zlib():
         raise OptimizationError("pycolmap was imported before zlib, by which Python crashes; import graphvio before it")
+    if threading.current_thread() is threading.main_thread():  # glog would print a stack at SIGTERM
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     return pycolmap
