@@ -200,6 +200,33 @@ def test_a_dark_pair_leaves_the_motion_to_the_single_camera(walk: Path) -> None:
     assert np.median(errors_m) < 0.005  # 50 mm in each frameset
 
 
+def test_a_single_camera_that_is_triggered_by_itself_claims_no_scale(walk: Path) -> None:
+    """Its depths come from motions that it measured itself: the pair and the IMU have the scale, and go on with it."""
+    source = open_source(walk)
+    assert source.truth is not None
+    truth, odometry = load_trajectory(source.truth), Odometry(source.rig)
+    begun_ns, silent_ns, number, estimates, events = source.start_ns, (3.0e9, 4.5e9), 0, [], []
+    for measurement in source:
+        if isinstance(measurement, FrameSet):
+            group, number = number % 2, number + 1
+            if group == 0 and silent_ns[0] < measurement.stamp_ns - begun_ns < silent_ns[1]:
+                continue
+            measurement = FrameSet(measurement.stamp_ns, {group: measurement.images[group]})
+        estimate = odometry.process(measurement)
+        events += odometry.take_events()
+        if estimate is not None:
+            estimates.append(estimate)
+    estimates += odometry.finish()
+    assert not {event.kind for event in events} & {EventKind.IMU_LEFT_OUT, EventKind.GATE_RESET, EventKind.LOST}
+    found, _ = truth.at(np.array([e.stamp_ns for e in estimates]), 0.1)
+    assert len(found.stamps_ns) == len(estimates)
+    assert estimates[0].nav_T_body is not None
+    nav_T_world = estimates[0].nav_T_body @ np.linalg.inv(found.nav_T_body[0])
+    for estimate, true_pose in zip(estimates, found.nav_T_body, strict=True):
+        assert estimate.nav_T_body is not None
+        assert np.linalg.norm(estimate.nav_T_body[:3, 3] - (nav_T_world @ true_pose)[:3, 3]) < 0.05
+
+
 def test_run_with_a_wrong_place_of_the_single_camera_learns_it(walk: Path, tmp_path: Path) -> None:
     """The camera is half a degree and 1 cm from where the file has it, of which the angle is reported."""
     rig = load_rig(walk)

@@ -23,6 +23,7 @@ from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 from graphvio.kernels import kernel
+from graphvio.measurements.motion import RelativeMotion
 
 _SIGMA = 0.01  # of a common scale, relative: wide next to what a good pair knows of a step, narrow next to the IMU
 _WEAKEST_SIGMA = 10.0  # rad and m, of directions that no point constrains
@@ -64,6 +65,46 @@ def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Ref
         cur_T_ref=se3_exp(step) @ refined.cur_T_ref,
         covariance=refined.covariance + gained,
         shared_covariance=refined.shared_covariance + gained,
+    )
+
+
+def covariance_of_free_scale(rig: RigArrays, observations: Observations, refined: Refined) -> Float:
+    """Return the covariance (6, 6) of a motion by single cameras whose length is not known at all, tangent as its own.
+
+    The depths are those of motions that the same cameras measured alone: an error of the scale would go on in them.
+    """
+    singles = np.unique(observations.pair[refined.inlier]).tolist()
+    along = np.array([_along_translation(rig, single, refined.cur_T_ref) for single in singles])
+    return np.asarray(along.T @ along)
+
+
+def with_possible_length(
+    rig: RigArrays, single: int, motion: RelativeMotion, predicted: Float, slack_m: float
+) -> RelativeMotion:
+    """Return a motion of single cameras with a length that the rig can have: while no depth is known, any fits.
+
+    Args:
+        rig: P pairs and single cameras.
+        single: The camera, or one of several.
+        motion: With any length.
+        predicted: ``cur_T_ref`` (4, 4) of body.
+        slack_m: By how much a translation may be longer than the predicted one.
+    """
+    body_T_cam = np.ascontiguousarray(rig.body_T_left[single])
+    cam_T_body = se3_inverse(body_T_cam)
+    measured = cam_T_body @ se3_inverse(motion.reference_T_current) @ body_T_cam
+    translation, expected = measured[:3, 3].copy(), (cam_T_body @ predicted @ body_T_cam)[:3, 3]
+    length, longest = np.linalg.norm(translation), np.linalg.norm(expected) + slack_m
+    if length <= longest:
+        return motion
+    measured[:3, 3] = translation * max(float(expected @ translation), 0.0) / length**2
+    share = np.diag(np.repeat([1.0, longest / length], 3))  # the direction is as uncertain as before
+    scaled = se3_adjoint(body_T_cam) @ share @ se3_adjoint(cam_T_body)
+    return replace(
+        motion,
+        reference_T_current=se3_inverse(body_T_cam @ measured @ cam_T_body),
+        covariance=scaled @ motion.covariance @ scaled.T,
+        shared_covariance=scaled @ motion.shared_covariance @ scaled.T,
     )
 
 

@@ -90,12 +90,15 @@ def graded_hypothesis(
     return GradedHypothesis(replace(motion, covariance=covariance), reasons)
 
 
-def graded(hypotheses: Sequence[GradedHypothesis], max_distance: float) -> tuple[RelativeMotion, Quality, str]:
+def graded(
+    hypotheses: Sequence[GradedHypothesis], max_distance: float, *, has_length: bool = True
+) -> tuple[RelativeMotion, Quality, str]:
     """Return the first hypothesis' motion, with a covariance that covers the others, its quality, and why.
 
     Args:
         hypotheses: In the order of `graphvio.frontend.agreement.Agreement`.
         max_distance: Largest squared Mahalanobis distance between pairs that agree.
+        has_length: Whether the first one's cameras can measure the length of a translation at all.
     """
     best, reasons = hypotheses[0].motion, list(hypotheses[0].reasons)
     covariance = best.covariance * max(1.0, max_distance / _T.max_usual_distance)
@@ -108,6 +111,7 @@ def graded(hypotheses: Sequence[GradedHypothesis], max_distance: float) -> tuple
             reasons.append(f"two motions are seen, {distance:.3f} m and {np.rad2deg(angle):.2f} deg apart")
     motion = replace(best, covariance=covariance)
     rotation_rad, translation_m = motion.weakest_sigmas
-    if not reasons and (rotation_rad > _T.max_rotation_sigma_rad or translation_m > _T.max_translation_sigma_m):
+    is_vague = rotation_rad > _T.max_rotation_sigma_rad or (has_length and translation_m > _T.max_translation_sigma_m)
+    if is_vague and not reasons:
         reasons.append(f"hardly constrained: {rotation_rad:.4f} rad, {translation_m:.3f} m")
     return motion, Quality.WEAK if reasons else Quality.GOOD, "; ".join(reasons)

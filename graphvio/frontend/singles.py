@@ -82,7 +82,8 @@ class SinglesFrontend(VisualFrontend):
         reference = next(iter(seen.reference.values()), None)
         cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
         if reference is not None and cur_T_reference is not None:
-            self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
+            for j in seen.frames:
+                self._histories[j].advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
 
     def _begin_keyframe(self, seen: Seen, motion_since: MotionPredictor) -> tuple[Seen, dict[int, CameraTracks]]:
         """Register later tracks on these images, with handed over and new ones, which other cameras may see, too."""

@@ -54,6 +54,7 @@ class QualityThresholds:
         max_rotation_sigma_rad: Standard deviation in the weakest direction beyond which a motion is weak.
         max_translation_sigma_m: The same of the translation.
         possible_speeds: (6,) rad/s and m/s that a rig may have where images say next to nothing.
+        max_excess_speed_m_s: By how much faster than predicted a motion by single cameras alone may be.
     """
 
     min_rival_share: float = 0.1
@@ -66,6 +67,7 @@ class QualityThresholds:
     possible_speeds: np.ndarray[tuple[int], np.dtype[np.float64]] = field(
         default_factory=lambda: np.repeat([0.5, 1.0], 3)
     )
+    max_excess_speed_m_s: float = 0.1
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.depth_errors import by_depth_errors
+from graphvio.frontend.depth_scale import covariance_of_free_scale, with_possible_length
 from graphvio.frontend.extrinsic_monitor import ExtrinsicError
 from graphvio.frontend.extrinsics import RigExtrinsics
 from graphvio.frontend.frozen import Frozen, FrozenImages
@@ -91,8 +92,11 @@ class VisualFrontend:
         self._config = config
         self._rig = rig
         self._extrinsics = RigExtrinsics(rig, config)
-        self._history = MotionHistory()
-        self._trackers = [GroupTracker(group, config, self._history, image_mask) for group in rig.groups]
+        self._histories = [MotionHistory() for _ in rig.groups]  # of each, since they may be triggered by themselves
+        self._trackers = [
+            GroupTracker(group, config, history, image_mask)
+            for group, history in zip(rig.groups, self._histories, strict=True)
+        ]
         self._baselines_m = _baselines_m(rig)
         self._frozen = FrozenImages()
         self._all_frozen = False
@@ -150,7 +154,8 @@ class VisualFrontend:
                 pair, see `agree`.
         """
         new_T_old = rig.pairs[0].left.body_T_cam @ self._rig.pairs[0].left.cam_T_body
-        self._history.recalibrate(new_T_old)
+        for history in self._histories:
+            history.recalibrate(new_T_old)
         self._rig = rig
         self._baselines_m = _baselines_m(rig)
         self._extrinsics.recalibrate(rig, uncertain)
@@ -200,10 +205,10 @@ class VisualFrontend:
         self.stage_ms = {}
         seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
         agreement, reason = self._estimate_motion(seen, motion_since)
-        graded_motion = self._grade(seen, agreement, reason)
+        graded_motion = self._grade(seen, agreement, reason, motion_since)
         is_stationary = self._detect_standstill(seen, agreement)
         self._drop_outliers(seen, agreement)
-        replenished, own = self._replenish(seen, agreement)
+        replenished, own = self._replenish(seen, agreement, motion_since)
         return VisualResult(
             graded_motion.motion,
             graded_motion.quality,
@@ -283,17 +288,19 @@ class VisualFrontend:
         return agreement, ""
 
     @timed("quality")
-    def _grade(self, seen: Seen, agreement: Agreement | None, reason: str) -> _Graded:
+    def _grade(self, seen: Seen, agreement: Agreement | None, reason: str, motion_since: MotionPredictor) -> _Graded:
         """Decide how far the motion can be trusted."""
         if agreement is None:
             return _Graded(None, Quality.FAILED, reason)
         hypotheses = self._graded_hypotheses(seen, agreement)
-        motion, quality, reason = graded(hypotheses, agreement.max_distance)
+        has_length = not self._is_of_singles(seen, agreement.hypotheses[0])
+        motion, quality, reason = graded(hypotheses, agreement.max_distance, has_length=has_length)
         alternatives = tuple(
-            replace(graded_one.motion, pairs=hypothesis.pairs)
+            replace(self._with_free_scale(seen, hypothesis, graded_one.motion, motion_since), pairs=hypothesis.pairs)
             for graded_one, hypothesis in zip(hypotheses, agreement.hypotheses, strict=True)
             if len(hypotheses) > 1
         )
+        motion = self._with_free_scale(seen, agreement.hypotheses[0], motion, motion_since)
         return _Graded(motion, quality, reason, alternatives)
 
     @timed("quality")
@@ -314,7 +321,7 @@ class VisualFrontend:
 
     @timed("replenish")
     def _replenish(
-        self, seen: Seen, agreement: Agreement | None
+        self, seen: Seen, agreement: Agreement | None, motion_since: MotionPredictor
     ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
         """Start a keyframe with new corners if it is time to, and learn from the pairs' own motions until then.
 
@@ -330,7 +337,12 @@ class VisualFrontend:
         own = self._own_motions(seen, agreement)
         self._extrinsics.learn(agreement.own)
         self._move_trackers()
-        self._history.advance(seen.reference_stamp_ns, seen.stamp_ns, refined.cur_T_ref, refined.covariance)
+        # Depths by a motion of single cameras alone would have the scale of earlier depths: that of the state is known.
+        is_of_singles = self._is_of_singles(seen, agreement.hypotheses[0])
+        predicted = motion_since(seen.reference_stamp_ns) if is_of_singles else None
+        cur_T_ref = refined.cur_T_ref if predicted is None else predicted
+        for j in seen.frames:
+            self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
         return self._refer_to(seen.frames), own
 
     # ------------------------------------------------------------------ parts of these steps
@@ -371,8 +383,9 @@ class VisualFrontend:
         if self._all_frozen:
             return dict(frames)
         newest_ns = max((frame.stamp_ns for frame in frames.values()), default=None)
-        if newest_ns is not None and newest_ns != self._history.newest_ns:
-            self._history.restart(newest_ns)
+        for j in frames:
+            if newest_ns is not None and newest_ns != self._histories[j].newest_ns:
+                self._histories[j].restart(newest_ns)
         replenished = self._in_parallel(lambda j: self._trackers[j].replenish(), frames)
         self._latest.update(replenished)
         self._references.replace(replenished)
@@ -393,6 +406,28 @@ class VisualFrontend:
             )
             for hypothesis in agreement.hypotheses
         ]
+
+    def _is_of_singles(self, seen: Seen, hypothesis: MotionHypothesis) -> bool:
+        """Return whether a motion explains points of single cameras only."""
+        explained = seen.correspondences.observations.pair[hypothesis.refined.inlier]
+        return bool(self._extrinsics.arrays.is_single[explained].all())
+
+    def _with_free_scale(
+        self, seen: Seen, hypothesis: MotionHypothesis, motion: RelativeMotion, motion_since: MotionPredictor
+    ) -> RelativeMotion:
+        """Let the length of a motion be unknown that single cameras alone have measured, by depths from motion."""
+        if not self._is_of_singles(seen, hypothesis):
+            return motion
+        arrays, observations, refined = self._extrinsics.arrays, seen.correspondences.observations, hypothesis.refined
+        of_scale = covariance_of_free_scale(arrays, observations, refined)
+        free = replace(
+            motion, covariance=motion.covariance + of_scale, shared_covariance=motion.shared_covariance + of_scale
+        )
+        predicted = motion_since(seen.reference_stamp_ns)
+        if predicted is None:
+            return free
+        slack_m = THRESHOLDS.quality.max_excess_speed_m_s * motion.duration_s
+        return with_possible_length(arrays, int(observations.pair[refined.inlier][0]), free, predicted, slack_m)
 
     def _relative_motion(self, seen: Seen, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
