@@ -7,6 +7,7 @@ import logging
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -42,6 +43,7 @@ from graphvio.rig_files import save_rig
 from graphvio.sources import Source
 from graphvio.sources.read_ahead import read_ahead
 from graphvio.sources.read_ahead_process import can_fork, read_ahead_in_process
+from graphvio.sources.reading import Reading
 
 S = 10**9
 
@@ -102,6 +104,16 @@ def test_rig_selects_pairs_and_imu(walk: Path) -> None:
     first = framesets(only_second)[0]
     assert list(first.images) == [0]
     np.testing.assert_array_equal(first.images[0][1], noise_image(300))
+
+
+def test_reading_of_one_pair_needs_no_images_of_the_other(walk: Path) -> None:
+    save_rig(small_rig(), walk / "rig.yaml")
+    shutil.rmtree(walk / "mav0" / "cam3")
+    source = Reading(pairs=(0,)).open(walk, None, None)
+    assert source.frameset_count == 10
+    assert source.faults.counts == {}
+    with pytest.raises(SourceError, match="has no camera cam3"):
+        Reading().open(walk, None, None)
 
 
 def test_euroc_truth_is_found(walk: Path) -> None:

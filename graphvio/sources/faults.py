@@ -4,22 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from graphvio.measurements.events import Event, EventKind
 
 _log = logging.getLogger(__name__)
-
-
-@contextmanager
-def unlogged() -> Iterator[None]:
-    """Count faults without a log, of a recording that is opened again for its measurements."""
-    _log.disabled = True
-    try:
-        yield
-    finally:
-        _log.disabled = False
 
 
 class FaultLog:

@@ -78,8 +78,7 @@ def read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[
     Returns:
         The index of all images and samples, the rig, and what was wrong with single files or lines so far.
     """
-    if not path.exists():
-        raise SourceError(f"{path}: does not exist; give the folder of a recording")
+    _check_exists(path)
     resolved = path.resolve()
     resolved = resolved.parent if resolved.name == "mav0" else resolved
     faults = FaultLog(resolved.name if resolved.is_dir() else resolved.stem)
@@ -92,6 +91,30 @@ def read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[
         raise SourceError(f"{path}: has no topics to be mapped; that is for sessions and bags")
     rig = _required(rig if rig is not None else find_rig(path), path)
     return layout.read_index(path, rig, faults), rig, faults
+
+
+def recorded_rig(path: Path) -> Rig:
+    """Read the rig that a recording carries, whether or not all of its cameras have images there.
+
+    Raises:
+        SourceError: if it cannot be read or has no known layout.
+        RigError: if it has no rig that is usable.
+        SessionError: if a session or bag cannot be read.
+        MissingExtraError: if it is a session or bag, and the extra ``sessions`` is not installed.
+    """
+    _check_exists(path)
+    try:
+        if is_store(path):
+            return _required(session.rig_in(open_store(path)), path)
+        layout_of(path)
+        return _required(find_rig(path), path)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+
+
+def _check_exists(path: Path) -> None:
+    if not path.exists():
+        raise SourceError(f"{path}: does not exist; give the folder of a recording")
 
 
 def layout_of(path: Path) -> Layout:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from graphvio.rig import Rig
-from graphvio.sources.faults import unlogged
-from graphvio.sources.opening import open_source
+from graphvio.sources.opening import open_source, recorded_rig
 from graphvio.sources.recording import Source
 
 
@@ -50,6 +49,4 @@ class Reading:
 
         if self.pairs is None and self.cameras is None and self.with_pairs and self.with_imu:
             return opened(rig)
-        with unlogged():  # the faults are those of the cameras that are chosen
-            whole = opened(rig).rig
-        return opened(self.of(whole))
+        return opened(self.of(recorded_rig(path) if rig is None else rig))
