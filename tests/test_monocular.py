@@ -15,6 +15,7 @@ import pytest
 from command_line import graphvio
 from live_runs import SOON_S, all_of, assert_same
 from real_clip import CLIP, real_clip
+from recordings import noise_image, small_rig
 from undrawn import undrawn
 
 from graphvio import Odometry, RigError, load_rig, open_source, save_rig
@@ -28,7 +29,7 @@ from graphvio.live.sources import open_live_source
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.motion import CameraTracks, CrossCameraMatches, HandedOverTracks
-from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
 from graphvio.monocular.adjustment import Measurements, adjust, covariance_of, equations, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
@@ -513,6 +514,27 @@ def test_factors_of_the_rig_file_change_only_for_clearly_likelier_ones() -> None
         return float(calibration.factors[1])
 
     assert [factor_by(sigmas) for sigmas in (3.0, 3.85, 5.0, 3.75, 3.0)] == [3.0, 3.0, 5.0, 5.0, 3.0]
+
+
+@pytest.mark.parametrize(("jitter_ms", "are_exact"), [(0.0, True), (0.1, True), (1.0, False)])
+def test_nothing_is_learnt_of_the_calibration_from_stamps_that_jitter(jitter_ms: float, are_exact: bool) -> None:
+    rig, rng = small_rig().without_pairs(), np.random.default_rng(1)
+    odometry, ms = Odometry(rig), 1_000_000
+    for k in range(20):
+        for sample_ns in range((50 * k + 5) * ms, (50 * k + 55) * ms, 5 * ms):
+            odometry.process(ImuSample(sample_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
+        images = {j: (noise_image(j),) for j in range(len(rig.groups))}
+        odometry.process(FrameSet(50 * k * ms + round(rng.normal(0.0, jitter_ms) * ms) + 40 * ms, images))
+    odometry.finish()
+    estimator = odometry._estimator
+    assert isinstance(estimator, MonocularEstimator)
+    calibration = estimator._calibration
+    assert calibration.are_stamps_exact == are_exact
+    prior = calibration._prior
+    information: Float = 1e4 * np.linalg.inv(prior.covariance).astype(np.float64)
+    difference = 3.0 * np.linalg.cholesky(prior.covariance) @ np.ones(len(prior.covariance))
+    assert calibration.update(Evidence(information, information @ difference)) == are_exact
+    assert calibration.is_file_exact != are_exact
 
 
 def test_first_guess_in_motion_finds_velocity_gravity_and_gyro_bias() -> None:

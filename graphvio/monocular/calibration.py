@@ -46,6 +46,8 @@ class WindowCalibration:
         factors: (G,) by which the file's errors exceed its standard deviations, of intrinsics and of extrinsics with
             the IMU; `EXACT` where the file is as good as exact.
         log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
+        are_stamps_exact: whether framesets' stamps are as good as exact. What others do to a path looks like errors of
+            the calibration, of which nothing is learnt then.
         latest: what is known of all parameters, updated once a second; None before, and where they are not estimated.
     """
 
@@ -65,6 +67,7 @@ class WindowCalibration:
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
         self.factors = self._first_factors = self.exact_factors
         self.log_bayes_factor = 0.0
+        self.are_stamps_exact = True
         self._files: dict[tuple[float, ...], Gaussian] = {}
         self.latest: CalibrationEstimate | None = None
         self._latest_ns = 0
@@ -86,7 +89,7 @@ class WindowCalibration:
     @property
     def candidates(self) -> list[Float]:
         """Factors (G,) with which a first window is tried."""
-        if not (self.is_file_exact and self.size):
+        if not (self.is_file_exact and self.size and self.are_stamps_exact):
             return [self.factors]
         return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]
 
@@ -145,7 +148,7 @@ class WindowCalibration:
 
         Arguments as `doubts_file`.
         """
-        if not self.size:
+        if not (self.size and self.are_stamps_exact):
             return False
         likelihood = FactorLikelihood(self._kept.plus(self._evidence_of(adjusted, prior)), self._prior)
         as_stated, far_off = (likelihood(np.array([_MIN_FACTOR, factor])) for factor in (EXACT, _FAR_OFF))
@@ -177,6 +180,8 @@ class WindowCalibration:
         Returns:
             Whether the factors have changed.
         """
+        if not self.are_stamps_exact:
+            return False
         before, self._evidence = self.factors, self._kept.plus(evidence)
         likelihood = FactorLikelihood(self._evidence, self._prior)
         found, self.log_bayes_factor = self._evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)

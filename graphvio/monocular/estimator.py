@@ -34,6 +34,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 
 _MAX_CONTRADICTION_NS = 1_000_000_000
+_MAX_STAMP_SIGMA_S = 3e-4  # beyond which a window's errors are those of stamps, and not of the calibration
 _MAX_IMU_ERROR2 = 150.0
 _REPORT_AFTER_NS = 5_000_000_000
 _TURNS_OTHERWISE = "the IMU turns otherwise than the cameras"
@@ -344,6 +345,10 @@ class MonocularEstimator:
         self._solver.calibration, self._solver.samples = self._calibration, self._samples
         self._are_trusted = True
         self._collect_keyframes()
+
+    def note_stamps(self, sigma_s: float) -> None:
+        """Take the standard deviation of the framesets' stamps, seconds, as it is known now."""
+        self._calibration.are_stamps_exact = sigma_s < _MAX_STAMP_SIGMA_S
 
     def doubt_imu(self, stamp_ns: int, is_doubted: bool) -> None:
         """Take note of whether the IMU turns as the cameras do; where it does not, there is no pose."""

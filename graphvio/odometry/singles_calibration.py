@@ -89,7 +89,8 @@ class SinglesCalibration:
         return visual
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Take a frameset for the windows."""
+        """Take note of how the stamps jitter, and take a frameset for the windows."""
+        self._estimator.note_stamps(self._synchroniser.stamp_sigma_s)
         if self._on_full_window is None:
             return
         if len(self._collector.keyframes) >= WINDOW:  # by now the IMU covers the last one
