@@ -799,6 +799,7 @@ def test_ctrl_c_while_a_process_is_forked_is_not_lost() -> None:
     program = (
         "import os, signal\n"
         "from graphvio.sources.read_ahead_process import read_ahead_in_process\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored where the tests run in the background
         "os.register_at_fork(before=lambda: os.kill(os.getpid(), signal.SIGINT))\n"
         "try:\n"
         "    next(read_ahead_in_process(lambda item: item, range(10), buffer_bytes=8))\n"

@@ -35,6 +35,14 @@ def test_stamps_in_other_units_are_refused(unit: str, tmp_path: Path) -> None:
         read_frame_csv(path, FaultLog("walk"))
 
 
+def test_rows_that_are_there_twice_are_counted(tmp_path: Path) -> None:
+    path, faults = imu_csv(tmp_path), FaultLog("walk")
+    first, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([first, *(row for row in rows for _ in range(2))]) + "\n")
+    assert read_imu_csv(path, faults).stamps_ns.tolist() == stamps()
+    assert faults.counts == {"imu_duplicate": ROWS}
+
+
 def test_rows_in_reverse_are_refused(tmp_path: Path) -> None:
     path = imu_csv(tmp_path)
     first, *rows = path.read_text().splitlines()

@@ -24,6 +24,7 @@ V = TypeVar("V")
 _MAX_STAMP_NS = 2**62  # the year 2116; offsets can be added without an overflow of int64
 _HOUR_NS = 3_600_000_000_000
 _MAX_OUTLIERS = 2
+_MIN_STEPS_SHARE = 0.2  # of steps that are not zero: stamps in seconds, read as nanoseconds, are mostly equal
 _MIN_PERIOD_NS, _MIN_ROWS = 20_000, 10  # no camera or IMU is faster than 50 kHz
 _FORCE_M_S2 = (5.0, 20.0)
 """Plausible median of the magnitude of specific force: gravity, and what a walk, a car or a drone adds."""
@@ -144,9 +145,13 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
 
 def _refuse_other_units(stamps_ns: Int, path: Path) -> None:
     """Refuse stamps of a whole table that can only be in seconds, milliseconds or microseconds."""
+    if len(stamps_ns) < _MIN_ROWS:
+        return
     steps_ns = np.diff(stamps_ns)
-    steps_ns = steps_ns[steps_ns != 0]  # rows that are there twice are counted later
-    if len(steps_ns) >= _MIN_ROWS - 1 and (period_ns := float(np.median(steps_ns))) < _MIN_PERIOD_NS:
+    if np.count_nonzero(steps_ns) > _MIN_STEPS_SHARE * len(steps_ns):
+        steps_ns = steps_ns[steps_ns != 0]  # rows that are there twice are counted later
+    period_ns = float(np.median(steps_ns))
+    if period_ns < _MIN_PERIOD_NS:
         if period_ns < 0.0:
             raise SourceError(f"{path}: stamps decrease from row to row; sort the rows by their stamps")
         raise SourceError(
