@@ -27,6 +27,7 @@ from graphvio.optimization.nodes import choose_nodes, spread
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Motions, Recorder, SessionRecord
 from graphvio.optimization.solver import Marginals
+from graphvio.optimization.workspace import Workspace
 from graphvio.rig import Imu
 from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
@@ -310,3 +311,13 @@ def test_optimize_wrong_imu_is_not_used(room_walk: Path) -> None:
     )
     assert after < 0.5 * before
     assert found.after["imu"].per_dimension < 0.3
+
+
+def test_folder_of_an_optimisation_is_refused_to_a_second_one_until_the_first_ends(tmp_path: Path) -> None:
+    inputs = {"walk": "1"}
+    with Workspace(tmp_path / "out", inputs).locked():
+        second = Workspace(tmp_path / "out", inputs)
+        with pytest.raises(OptimizationError, match="another run writes into it"), second.locked():
+            pass
+    with Workspace(tmp_path / "out", inputs).locked():
+        pass
