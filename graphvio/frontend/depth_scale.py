@@ -21,6 +21,7 @@ from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.linearisation import allocate_points, linearise, relinearise_points
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
+from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 from graphvio.kernels import kernel
 from graphvio.measurements.motion import RelativeMotion
@@ -68,17 +69,40 @@ def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Ref
     )
 
 
-def covariance_of_free_scale(rig: RigArrays, observations: Observations, refined: Refined) -> Float:
-    """Return the covariance (6, 6) of a motion by single cameras whose length is not known at all, tangent as its own.
+def is_of_singles(rig: RigArrays, observations: Observations, refined: Refined) -> bool:
+    """Return whether a motion explains points of single cameras only, so that its length is that of their depths."""
+    return bool(rig.is_single[observations.pair[refined.inlier]].all())
+
+
+def with_free_length(
+    rig: RigArrays, observations: Observations, refined: Refined, motion: RelativeMotion, predicted: Float | None
+) -> RelativeMotion:
+    """Let the length of a motion be unknown that single cameras alone have measured; another one stays as it is.
 
     The depths are those of motions that the same cameras measured alone: an error of the scale would go on in them.
+
+    Args:
+        rig: P pairs and single cameras.
+        observations: N points.
+        refined: The solution for them.
+        motion: The same, with its covariance.
+        predicted: ``cur_T_ref`` (4, 4) of body by the state, or None where it is not known.
     """
+    if not is_of_singles(rig, observations, refined):
+        return motion
     singles = np.unique(observations.pair[refined.inlier]).tolist()
     along = np.array([_along_translation(rig, single, refined.cur_T_ref) for single in singles])
-    return np.asarray(along.T @ along)
+    of_scale = along.T @ along
+    motion = replace(
+        motion, covariance=motion.covariance + of_scale, shared_covariance=motion.shared_covariance + of_scale
+    )
+    if predicted is None:
+        return motion
+    slack_m = THRESHOLDS.quality.max_excess_speed_m_s * motion.duration_s
+    return _with_possible_length(rig, int(observations.pair[refined.inlier][0]), motion, predicted, slack_m)
 
 
-def with_possible_length(
+def _with_possible_length(
     rig: RigArrays, single: int, motion: RelativeMotion, predicted: Float, slack_m: float
 ) -> RelativeMotion:
     """Return a motion of single cameras with a length that the rig can have: while no depth is known, any fits.

@@ -14,7 +14,7 @@ from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.depth_errors import by_depth_errors
-from graphvio.frontend.depth_scale import covariance_of_free_scale, with_possible_length
+from graphvio.frontend.depth_scale import is_of_singles, with_free_length
 from graphvio.frontend.extrinsic_monitor import ExtrinsicError
 from graphvio.frontend.extrinsics import RigExtrinsics
 from graphvio.frontend.frozen import Frozen, FrozenImages
@@ -292,16 +292,21 @@ class VisualFrontend:
         """Decide how far the motion can be trusted."""
         if agreement is None:
             return _Graded(None, Quality.FAILED, reason)
-        hypotheses = self._graded_hypotheses(seen, agreement)
-        has_length = not self._is_of_singles(seen, agreement.hypotheses[0])
+        arrays, observations = self._extrinsics.arrays, seen.correspondences.observations
+        predicted = motion_since(seen.reference_stamp_ns) if self._rig.singles else None
+
+        def with_length(motion: RelativeMotion, hypothesis: MotionHypothesis) -> RelativeMotion:
+            return with_free_length(arrays, observations, hypothesis.refined, motion, predicted)
+
+        hypotheses, best = self._graded_hypotheses(seen, agreement), agreement.hypotheses[0]
+        has_length = not is_of_singles(arrays, observations, best.refined)
         motion, quality, reason = graded(hypotheses, agreement.max_distance, has_length=has_length)
         alternatives = tuple(
-            replace(self._with_free_scale(seen, hypothesis, graded_one.motion, motion_since), pairs=hypothesis.pairs)
+            replace(with_length(graded_one.motion, hypothesis), pairs=hypothesis.pairs)
             for graded_one, hypothesis in zip(hypotheses, agreement.hypotheses, strict=True)
             if len(hypotheses) > 1
         )
-        motion = self._with_free_scale(seen, agreement.hypotheses[0], motion, motion_since)
-        return _Graded(motion, quality, reason, alternatives)
+        return _Graded(with_length(motion, best), quality, reason, alternatives)
 
     @timed("quality")
     def _detect_standstill(self, seen: Seen, agreement: Agreement | None) -> bool:
@@ -338,8 +343,8 @@ class VisualFrontend:
         self._extrinsics.learn(agreement.own)
         self._move_trackers()
         # Depths by a motion of single cameras alone would have the scale of earlier depths: that of the state is known.
-        is_of_singles = self._is_of_singles(seen, agreement.hypotheses[0])
-        predicted = motion_since(seen.reference_stamp_ns) if is_of_singles else None
+        are_singles = is_of_singles(self._extrinsics.arrays, seen.correspondences.observations, refined)
+        predicted = motion_since(seen.reference_stamp_ns) if are_singles else None
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
         for j in seen.frames:
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
@@ -406,28 +411,6 @@ class VisualFrontend:
             )
             for hypothesis in agreement.hypotheses
         ]
-
-    def _is_of_singles(self, seen: Seen, hypothesis: MotionHypothesis) -> bool:
-        """Return whether a motion explains points of single cameras only."""
-        explained = seen.correspondences.observations.pair[hypothesis.refined.inlier]
-        return bool(self._extrinsics.arrays.is_single[explained].all())
-
-    def _with_free_scale(
-        self, seen: Seen, hypothesis: MotionHypothesis, motion: RelativeMotion, motion_since: MotionPredictor
-    ) -> RelativeMotion:
-        """Let the length of a motion be unknown that single cameras alone have measured, by depths from motion."""
-        if not self._is_of_singles(seen, hypothesis):
-            return motion
-        arrays, observations, refined = self._extrinsics.arrays, seen.correspondences.observations, hypothesis.refined
-        of_scale = covariance_of_free_scale(arrays, observations, refined)
-        free = replace(
-            motion, covariance=motion.covariance + of_scale, shared_covariance=motion.shared_covariance + of_scale
-        )
-        predicted = motion_since(seen.reference_stamp_ns)
-        if predicted is None:
-            return free
-        slack_m = THRESHOLDS.quality.max_excess_speed_m_s * motion.duration_s
-        return with_possible_length(arrays, int(observations.pair[refined.inlier][0]), free, predicted, slack_m)
 
     def _relative_motion(self, seen: Seen, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
