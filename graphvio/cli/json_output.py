@@ -38,6 +38,7 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*, verbose: bool = False, as_json: bool = False, **values: Any) -> None:
+        """Run the command; with ``as_json``, print its document alone."""
         if not as_json:
             command(**values)
             return

@@ -101,6 +101,7 @@ def _error(measured: Float, twists: tuple[Float, Float] | None) -> Callable[...,
     inverse = se3_inverse(measured)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
+        """Return the error, and write its derivatives where gtsam asks for them."""
         keys = factor.keys()
         then, now, correction = (values.atPose3(key).matrix() for key in keys[:3])
         before, after = correction, correction

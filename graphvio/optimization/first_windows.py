@@ -107,6 +107,7 @@ def _error(
     of_velocity, of_gravity, of_gyro, of_accel = np.split(root[:, 6 * (len(poses) - 1) :], 4, axis=1)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
+        """Return the error, and write its derivatives where gtsam asks for them."""
         *of_poses, of_first, of_bias = factor.keys()
         now = [values.atPose3(key).matrix() for key in of_poses]
         inverse = se3_inverse(now[0])
