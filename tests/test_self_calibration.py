@@ -196,6 +196,19 @@ def test_file_factor_of_exact_files_is_exact() -> None:
     assert false_alarms == 0
 
 
+@pytest.mark.parametrize("which", [0, 1])
+def test_file_factors_of_what_two_groups_explain_are_those_of_the_likelier_one(which: int) -> None:
+    """A sum of two parameters is off by six sigma, and one group's other parameters are off as well."""
+    prior = FilePrior(np.eye(8), np.repeat([0, 1], 4))
+    x = np.where(prior.group == which, [6.0, 1.5, -1.5, 1.5, 1.5, -1.5, 1.5, 6.0], 0.0)
+    rows, sigmas = np.eye(8)[:7], np.array([0.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    rows[0, 7] = 1.0
+    information, vector = rows.T / sigmas**2 @ rows, rows.T / sigmas**2 @ rows @ x
+    factors, _ = Evidence(information, vector).file_factors(prior, np.full(2, 10.0))
+    assert factors[which] > 1.0
+    assert factors[1 - which] == EXACT
+
+
 def test_forgotten_evidence_never_gains_and_keeps_the_mean_where_it_is_regular() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((5, 5))

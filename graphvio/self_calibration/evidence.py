@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -120,7 +121,7 @@ class Evidence(NamedTuple):
         """Return by which factors the rig file's errors exceed its standard deviations, by maximum likelihood.
 
         The calibration itself is integrated out (type II maximum likelihood; D. J. C. MacKay, *Bayesian interpolation*,
-        1992), and one group after the other is varied.
+        1992), and one group after the other is varied, in turns until none changes.
 
         Args:
             prior: of the calibration.
@@ -131,22 +132,12 @@ class Evidence(NamedTuple):
             The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
             over that of an exact file.
         """
-        factors, likelihood = np.full(prior.n_groups, EXACT), likelihood or FactorLikelihood(self, prior)
-        exact = best = likelihood(factors)
-        for _ in range(_SWEEPS):
-            before = factors.copy()
-            for group in range(prior.n_groups):
-                likelihoods = []
-                for factor in _FACTORS:
-                    factors[group] = factor
-                    likelihoods.append(likelihood(factors))
-                found = int(np.argmax(likelihoods))
-                if likelihoods[found] - likelihoods[0] < min_gains[group]:
-                    found = 0
-                factors[group], best = _FACTORS[found], likelihoods[found]
-            if np.array_equal(factors, before):
-                break
-        return factors, best - exact
+        likelihood = likelihood or FactorLikelihood(self, prior)
+        groups = list(range(prior.n_groups))
+        # Two groups may explain the same, and the one that is varied first then takes it all: each is first once.
+        maxima = [_ascended(likelihood, groups[first:] + groups[:first], min_gains) for first in groups]
+        factors = max(maxima, key=likelihood)
+        return factors, likelihood(factors) - likelihood(np.full(prior.n_groups, EXACT))
 
     def mean_square(self, prior: FilePrior, in_force: Float, likelihood: FactorLikelihood | None = None) -> Float:
         """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
@@ -191,3 +182,22 @@ class FactorLikelihood:
         fitted = solve_lower(lower, evidence.vector.reshape(1, -1))[0]
         likelihood = float(fitted @ fitted - 2.0 * np.log(each * np.diag(lower)).sum())
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite
+
+
+def _ascended(likelihood: FactorLikelihood, order: Sequence[int], min_gains: Float) -> Float:
+    """Return the factors (G,) to which a coordinate ascent leads from an exact file, for an order of the groups."""
+    factors = np.full(len(order), EXACT)
+    for _ in range(_SWEEPS):
+        before = factors.copy()
+        for group in order:
+            likelihoods = []
+            for factor in _FACTORS:
+                factors[group] = factor
+                likelihoods.append(likelihood(factors))
+            found = int(np.argmax(likelihoods))
+            if likelihoods[found] - likelihoods[0] < min_gains[group]:
+                found = 0
+            factors[group] = _FACTORS[found]
+        if np.array_equal(factors, before):
+            break
+    return factors

@@ -145,7 +145,9 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
     yield "cameras to IMU, translation", "mm", 1e3, extrinsics[3:], 3.0, _TURN
     yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN
     yield "IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN
-    yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION
+    # With pairs, accelerations are seen in units of the baselines: where both differ, nothing shows which one is wrong.
+    scale = "IMU, accelerometer's scale" + (" (or that of all baselines)" if rig.pairs else "")
+    yield scale, "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION
 
 
 def _of_lens(
