@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
@@ -16,6 +16,7 @@ from graphvio.cli.info import dump_config, info
 from graphvio.cli.json_output import with_json
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
+from graphvio.cli.output import lasting_streams
 from graphvio.cli.record import convert, record
 from graphvio.cli.requirements import check_requirements
 from graphvio.cli.rig import rig
@@ -87,15 +88,27 @@ _add(with_json(warmup))
 def main() -> None:
     """Run the program: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
     limit_blas_threads()  # no module of the command line has imported numpy by now
+    with lasting_streams() as output:
+        code = _run()
+        if output is not None:
+            output.flush()
+            if output.error is not None and not isinstance(output.error, BrokenPipeError):  # its reader has enough
+                warn(f"standard output cannot be written ({output.error.strerror}); write it to another place")
+                code = code or EXIT_BAD_INPUT
+    sys.exit(code)
+
+
+def _run() -> int:
+    """Run the program, and return its exit code."""
     try:
         with interruptible():
             code = app(prog_name="graphvio", standalone_mode=False)
     except (typer.Abort, KeyboardInterrupt):
-        sys.exit(EXIT_INTERRUPTED)
+        return EXIT_INTERRUPTED
     except GraphvioError as error:
         if "--verbose" in sys.argv:
             raise
-        _refuse(str(error))
+        return _refuse(str(error))
     except Exception as error:
         usage = getattr(error, "format_message", None)  # of the command-line library's own errors
         if usage is None:
@@ -103,16 +116,15 @@ def main() -> None:
         context = getattr(error, "ctx", None)
         if context is not None and usage() == context.get_help():  # no command was given
             typer.echo(usage(), err=True)
-            sys.exit(EXIT_BAD_INPUT)
+            return EXIT_BAD_INPUT
         message = " ".join(usage().split())
         hint = "graphvio --help lists the commands"
         if context is not None and context.parent is not None:
             hint = f"{context.command_path} --help shows its use"
-        _refuse(f"{message}  ({hint})")
-    else:
-        sys.exit(code if isinstance(code, int) else 0)
+        return _refuse(f"{message}  ({hint})")
+    return code if isinstance(code, int) else 0
 
 
-def _refuse(message: str) -> NoReturn:
+def _refuse(message: str) -> int:
     warn(message)
-    sys.exit(EXIT_BAD_INPUT)
+    return EXIT_BAD_INPUT

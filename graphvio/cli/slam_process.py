@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from graphvio.cli.output import lasting_streams
 from graphvio.cli.shared import EXIT_BAD_INPUT, warn
 from graphvio.errors import GraphvioError, MapError, ServiceError
 from graphvio.runtime import stop_signals_blocked
@@ -121,8 +122,9 @@ def _map(task: MappingTask, ready: Event) -> None:
     """Run the task in the process."""
     from graphvio.mapping.process import run_mapping
 
-    try:
-        typer.echo(run_mapping(task, ready), err=True)
-    except GraphvioError as error:
-        warn(f"mapping: {error}")
-        raise SystemExit(EXIT_BAD_INPUT) from None
+    with lasting_streams():
+        try:
+            typer.echo(run_mapping(task, ready), err=True)
+        except GraphvioError as error:
+            warn(f"mapping: {error}")
+            raise SystemExit(EXIT_BAD_INPUT) from None
