@@ -137,10 +137,47 @@ def test_list_of_live_devices_is_one_document() -> None:
     assert {"v4l2", "realsense", "oak", "ros2"} <= {each["kind"] for each in listed}
 
 
-def test_failure_prints_no_document(tmp_path: Path) -> None:
-    ran = graphvio("run", tmp_path / "none", "--json")
-    assert (ran.returncode, ran.stdout) == (2, "")
-    assert "does not exist" in ran.stderr
+@pytest.mark.parametrize(
+    ("typed", "kind"),
+    [
+        ("run none", "SourceError"),
+        ("info none", "SourceError"),
+        ("rig none", "RigError"),
+        ("evaluate none none", "TrajectoryError"),
+        ("dump-config none", "ConfigError"),
+        ("run none --from -1", "UsageError"),
+        ("rig", "UsageError"),
+    ],
+)
+def test_json_command_fails_prints_its_error(typed: str, kind: str, tmp_path: Path) -> None:
+    ran = graphvio(*typed.split(), "--json", folder=tmp_path)
+    assert ran.returncode == 2
+    error = json.loads(ran.stdout)["error"]
+    assert set(error) == {"kind", "message"}
+    assert error["kind"] == kind
+    assert ran.stderr.startswith(f"graphvio: {error['message']}")
+    assert ran.stderr == graphvio(*typed.split(), folder=tmp_path).stderr
+
+
+def test_json_command_interrupted_prints_its_error(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_, **__: None)
+    monkeypatch.setattr("graphvio.pipeline.run", interrupted)
+    ran = graphvio("run", walk, "--out", tmp_path / "out", "--json")
+    assert ran.returncode == 130
+    assert json.loads(ran.stdout)["error"]["kind"] == "Interrupted"
+
+
+def test_json_command_crashes_prints_its_error(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(*_: object) -> None:
+        raise ZeroDivisionError("an error of the program")
+
+    monkeypatch.setattr("graphvio.sources.contents.describe_folder", crash)
+    ran = graphvio("info", walk, "--json")
+    assert ran.returncode == 1
+    assert json.loads(ran.stdout) == {"error": {"kind": "ZeroDivisionError", "message": "an error of the program"}}
 
 
 def test_numbers_agree_with_the_files(results: Path, walk: Path, tmp_path: Path) -> None:

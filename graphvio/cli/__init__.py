@@ -13,7 +13,7 @@ from graphvio.cli.doctor import doctor
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
 from graphvio.cli.info import dump_config, info
-from graphvio.cli.json_output import with_json
+from graphvio.cli.json_output import print_error, with_json
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.output import lasting_streams
@@ -104,14 +104,17 @@ def _run() -> int:
         with interruptible():
             code = app(prog_name="graphvio", standalone_mode=False)
     except (typer.Abort, KeyboardInterrupt):
+        print_error("Interrupted", "interrupted")
         return EXIT_INTERRUPTED
     except GraphvioError as error:
+        print_error(type(error).__name__, str(error))
         if "--verbose" in sys.argv:
             raise
         return _refuse(str(error))
     except Exception as error:
         usage = getattr(error, "format_message", None)  # of the command-line library's own errors
         if usage is None:
+            print_error(type(error).__name__, str(error))
             raise
         context = getattr(error, "ctx", None)
         if context is not None and usage() == context.get_help():  # no command was given
@@ -121,6 +124,7 @@ def _run() -> int:
         hint = "graphvio --help lists the commands"
         if context is not None and context.parent is not None:
             hint = f"{context.command_path} --help shows its use"
+        print_error("UsageError", message)
         return _refuse(f"{message}  ({hint})")
     return code if isinstance(code, int) else 0
 

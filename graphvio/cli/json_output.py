@@ -1,4 +1,4 @@
-"""``--json`` of all commands that print a table or a summary: one document on stdout, and nothing else."""
+"""``--json`` of all commands that print a table or a summary: one document on stdout, and nothing else there."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import inspect
 import io
 import json
 import math
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from contextvars import ContextVar
@@ -29,11 +30,22 @@ def publish(result: object) -> None:
         results.append(result)
 
 
+def error_document(kind: str, message: str) -> dict[str, dict[str, str]]:
+    """Return what ``--json`` prints of a command that fails."""
+    return {"error": {"kind": kind, "message": message}}
+
+
+def print_error(kind: str, message: str) -> None:
+    """Print the document of an error if ``--json`` was given, of whatever command."""
+    if "--json" in sys.argv:
+        typer.echo(json.dumps(error_document(kind, message), indent=2))
+
+
 def with_json(command: Callable[..., None]) -> Callable[..., None]:
     """Add ``--json`` to a command that publishes its result; its lines on stdout are then left out.
 
-    A command that ends with an exit code of its own still prints the document; one that fails prints none.
-    ``--verbose`` is added, too, which `graphvio.cli.main` looks for.
+    A command that ends with an exit code of its own still prints the document; of one that fails, `graphvio.cli.main`
+    prints the error. ``--verbose`` is added, too, which `graphvio.cli.main` looks for.
     """
 
     @wraps(command)

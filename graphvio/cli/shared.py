@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Self
 
 import typer
 
+from graphvio.cli.json_output import error_document, publish
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -191,6 +193,7 @@ def ends_at_interrupt(message: str) -> Iterator[None]:
         with interruptible():
             yield
     except KeyboardInterrupt:
+        publish(error_document("Interrupted", message))
         warn(message)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
