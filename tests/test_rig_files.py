@@ -414,6 +414,19 @@ def test_load_rig_kalibr(tmp_path: Path, chain: str, imu: str, nested: bool) -> 
     assert_same(loaded, load_rig(tmp_path))
 
 
+@pytest.mark.parametrize(
+    ("chain", "imu"), [("my-imu.yaml", "imu.yaml"), ("imu.yaml", "adis-imu.yaml"), ("imucam.yaml", "camchain-imu.yaml")]
+)
+def test_load_rig_kalibr_chain_named_after_the_imu_is_not_taken_for_it(tmp_path: Path, chain: str, imu: str) -> None:
+    rig = small_rig(1)
+    (tmp_path / chain).write_text(kalibr_chain(rig))
+    (tmp_path / f"copy-of-{chain}").write_text(kalibr_chain(rig))
+    with pytest.raises(RigError, match=r"no imu\.yaml next to it"):
+        load_rig(tmp_path / chain)
+    (tmp_path / imu).write_text(KALIBR_IMU)
+    assert load_rig(tmp_path / chain).imu == Imu()
+
+
 KALIBR_LENSES = {
     "double-sphere": ("ds", ["xi", "alpha"]),
     "extended-unified": ("eucm", ["alpha", "beta"]),

@@ -141,9 +141,11 @@ def find_imu_file(camchain: Path) -> Path:
     stem = camchain.name
     likely = [stem.replace("camchain-imucam", "imu"), stem.replace("camchain", "imu")]
     for name in [*likely, "imu.yaml", "imu_config.yaml", "imu0.yaml"]:
-        if name != stem and (camchain.parent / name).is_file():
-            return camchain.parent / name
-    others = sorted(p for p in camchain.parent.glob("*imu*.y*ml") if "camchain" not in p.name)
+        file = camchain.parent / name
+        if name != stem and file.is_file() and not camera_names(read_yaml(file)):
+            return file
+    named_so = sorted(camchain.parent.glob("*imu*.y*ml"))  # as chains and their copies may be
+    others = [file for file in named_so if file != camchain and not camera_names(read_yaml(file))]
     if len(others) == 1:
         return others[0]
     defaults = ", ".join(f"{IMU_KEYS[name]}: {getattr(Imu(), name)}" for name in NOISE_KEYS)
