@@ -25,6 +25,10 @@ _COLUMNS = 8
 _KITTI_COLUMNS = 12
 _NORM_TOLERANCE = 0.05
 _MAX_STAMP_NS = 2**62
+_UNITS = {"milliseconds": 3, "microseconds": 6, "nanoseconds": 9}  # power of ten of a second
+_UNIX_S = (10**9, 2 * 10**9)  # the years 2001 to 2033
+_MAX_STEP_S, _MIN_STEP_NS = 3600.0, 20_000.0  # plausible medians of the time from pose to pose
+_MIN_STEPS = 3
 _SESSION_SUFFIXES = (".mcap", ".bag")
 _ACCEPTED = "give a trajectory file (TUM, EuRoC or KITTI), or BAG:TOPIC"
 
@@ -101,6 +105,41 @@ def stamp_ns_from_seconds(text: str) -> int:
         raise ValueError(f"{text!r} is no time") from None
 
 
+def _unit_of(stamp_s: str) -> str:
+    """Return the unit of a Unix time that would be absurd in seconds; empty if there is none."""
+    try:
+        stamp = abs(Decimal(stamp_s))
+        units = [unit for unit, power in _UNITS.items() if _UNIX_S[0] <= stamp.scaleb(-power) < _UNIX_S[1]]
+    except DecimalException:
+        return ""
+    return units[0] if units else ""
+
+
+def _in_other_unit(where: str, unit: str) -> TrajectoryError:
+    return TrajectoryError(
+        f"{where}: stamps appear to be in {unit}, and have to be in seconds: divide them by 1e{_UNITS[unit]} (only "
+        "EuRoC files, with commas between the columns, have nanoseconds)"
+    )
+
+
+def _refuse_other_units(stamps_ns: Sequence[int], is_euroc: bool, path: Path) -> None:
+    """Refuse stamps that are as far apart as only those in another unit are.
+
+    Raises:
+        TrajectoryError: if they are.
+    """
+    if len(stamps_ns) <= _MIN_STEPS:
+        return
+    step_ns = float(np.median(np.diff(np.array(stamps_ns, dtype=np.int64))))
+    if not is_euroc and step_ns > _MAX_STEP_S * _NS_PER_S:
+        raise _in_other_unit(str(path), "microseconds" if step_ns < 1e6 * _NS_PER_S else "nanoseconds")
+    if is_euroc and step_ns < _MIN_STEP_NS:
+        raise TrajectoryError(
+            f"{path}: poses are {step_ns:g} ns apart in the median; stamps of EuRoC files have to be whole "
+            "nanoseconds, not seconds, milliseconds or microseconds"
+        )
+
+
 def _load_from_session(path: Path, topic: str | None = None) -> Trajectory:
     if not is_store(path):
         raise TrajectoryError(f"{path}: is no trajectory file, and no session; {_ACCEPTED}")
@@ -135,6 +174,7 @@ def _load_text(path: Path, times: Path | None) -> Trajectory:
         poses.append(pose)
     if not poses:
         raise TrajectoryError(f"{path}: holds no pose; the run that wrote it estimated nothing, or it is another file")
+    _refuse_other_units(stamps, rows[0][2], path)
     return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses))
 
 
@@ -145,7 +185,11 @@ def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]], tim
     if times is None:
         raise TrajectoryError(f"{path}: KITTI poses carry no stamps; give --times FILE, or put times.txt next to them")
     try:
-        stamps = [stamp_ns_from_seconds(line) for line in times.read_text(encoding="utf-8").split()]
+        seconds = times.read_text(encoding="utf-8").split()
+        unit = _unit_of(seconds[0]) if seconds else ""
+        if unit:
+            raise _in_other_unit(str(times), unit)
+        stamps = [stamp_ns_from_seconds(each) for each in seconds]
         blocks = np.array([[float(field) for field in fields] for _, fields, _ in rows]).reshape(-1, 3, 4)
     except (ValueError, OSError) as error:
         raise TrajectoryError(f"{path}: with {times}: is not numeric ({error}); correct the line") from None
@@ -185,6 +229,9 @@ def _pose(fields: Sequence[str], is_euroc: bool, where: str) -> tuple[int, Float
     if len(fields) < _COLUMNS:
         layout = "stamp_ns,x,y,z,qw,qx,qy,qz" if is_euroc else "stamp_s x y z qx qy qz qw"
         raise TrajectoryError(f"{where}: has {len(fields)} columns; a pose needs {_COLUMNS}: {layout}")
+    unit = "" if is_euroc else _unit_of(fields[0])
+    if unit:
+        raise _in_other_unit(where, unit)
     try:
         stamp = int(fields[0]) if is_euroc else stamp_ns_from_seconds(fields[0])
         values = np.array([float(field) for field in fields[1:_COLUMNS]])

@@ -104,6 +104,46 @@ def test_load_invalid_line_raises_with_its_number(tmp_path: Path, text: str, mes
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("unit", "in_s", "start_s"),
+    [
+        ("milliseconds", 10**3, 1_700_000_000),
+        ("microseconds", 10**6, 1_700_000_000),
+        ("nanoseconds", 10**9, 1_700_000_000),
+        ("microseconds", 10**6, 0),
+        ("nanoseconds", 10**9, 0),  # milliseconds from 0 may be a pose every 50 s
+    ],
+)
+def test_load_tum_with_stamps_in_another_unit_names_it(tmp_path: Path, unit: str, in_s: int, start_s: int) -> None:
+    file = tmp_path / "bad.txt"
+    stamps = [start_s * in_s + k * in_s // 20 for k in range(10)]
+    file.write_text("".join(f"{stamp} 0 0 0 0 0 0 1\n" for stamp in stamps))
+    with pytest.raises(TrajectoryError, match=unit):
+        load_trajectory(file)
+
+
+def test_load_tum_of_long_ago_or_sparse_is_taken(tmp_path: Path) -> None:
+    file = tmp_path / "good.txt"
+    for stamps in ([0, 60, 120, 180, 240], [1e9 + 60 * k for k in range(5)]):
+        file.write_text("".join(f"{stamp} 0 0 0 0 0 0 1\n" for stamp in stamps))
+        assert len(load_trajectory(file)) == 5
+
+
+def test_load_euroc_with_stamps_in_seconds_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "bad.csv"
+    file.write_text("".join(f"{stamp},0,0,0,1,0,0,0\n" for stamp in range(1_700_000_000, 1_700_000_010)))
+    with pytest.raises(TrajectoryError, match="nanoseconds"):
+        load_trajectory(file)
+
+
+def test_load_kitti_with_times_in_nanoseconds_names_the_unit(tmp_path: Path) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (tmp_path / "times.txt").write_text("1700000000000000000\n")
+    with pytest.raises(TrajectoryError, match=r"times\.txt.*nanoseconds"):
+        load_trajectory(file)
+
+
 def test_load_or_save_unusable_path_raises(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(bytes(range(128, 256)))
     with pytest.raises(TrajectoryError, match="not a text file"):
