@@ -16,7 +16,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import SessionError, TrajectoryError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
-from graphvio.sessions.store import is_store
+from graphvio.sessions.store import SUFFIXES, is_store
 from graphvio.sessions.truth import read_poses
 from graphvio.trajectory import Trajectory
 
@@ -29,7 +29,6 @@ _UNITS = {"milliseconds": 3, "microseconds": 6, "nanoseconds": 9}  # power of te
 _UNIX_S = (10**9, 2 * 10**9)  # the years 2001 to 2033
 _MAX_STEP_S, _MIN_STEP_NS = 3600.0, 20_000.0  # plausible medians of the time from pose to pose
 _MIN_STEPS = 3
-_SESSION_SUFFIXES = (".mcap", ".bag")
 _ACCEPTED = "give a trajectory file (TUM, EuRoC or KITTI), or BAG:TOPIC"
 
 
@@ -53,7 +52,7 @@ def load_trajectory(path: str | Path, times: Path | None = None) -> Trajectory:
     if not path.exists() and ":/" in str(path):
         store, _, topic = str(path).partition(":/")
         return _load_from_session(Path(store), f"/{topic}")
-    if path.suffix in _SESSION_SUFFIXES or path.is_dir():
+    if path.suffix in SUFFIXES or path.is_dir():
         return _load_from_session(path)
     return _load_text(path, times)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,11 +94,11 @@ def ros1_bag(messages: list[Message], path: Path) -> Path:
 def bag(kind: str, messages: list[Message], folder: Path) -> Path:
     if kind == "ros1":
         return ros1_bag(messages, folder / "walk.bag")
-    made = ros2_bag(messages, folder / "walk", "SQLITE3" if kind == "db3" else "MCAP")
-    return next(made.glob("*.mcap")) if kind == "mcap file" else made
+    made = ros2_bag(messages, folder / "walk", "MCAP" if kind.startswith("mcap") else "SQLITE3")
+    return next(made.glob("*" + kind.removesuffix(" file"))) if kind.endswith(" file") else made
 
 
-@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap", "mcap file"])
+@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap", "db3 file", "mcap file"])
 def test_bag_yields_the_recorded_measurements(kind: str, recording: Path, tmp_path: Path) -> None:
     original = open_source(recording)
     path = bag(kind, messages(recording, tmp_path), tmp_path)
@@ -185,8 +186,35 @@ def test_describe_gives_the_latency(recording: Path, tmp_path: Path) -> None:
     assert {topic.name: topic.latency_ms for topic in found.topics}["/imu"] == pytest.approx(3.0)
 
 
+def test_ros2_bag_without_metadata_names_its_files(recording: Path, tmp_path: Path) -> None:
+    path = bag("db3", messages(recording, tmp_path), tmp_path)
+    (path / "metadata.yaml").unlink()
+    file = next(path.glob("*.db3"))
+    with pytest.raises(SourceError, match=re.escape(f"holds the recording {file}; give that")):
+        open_source(path)
+    for name in ("walk_0.db3", "walk_1.db3"):
+        (path / name).write_bytes(file.read_bytes())
+    file.unlink()
+    with pytest.raises(SourceError, match=r"walk_0\.db3.*walk_1\.db3.*ros2 bag reindex"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no database"])
+def test_ros2_file_damaged_is_refused(content: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "walk.db3"
+    file.write_bytes(content)
+    with pytest.raises(SessionError, match=re.escape(str(file))):
+        open_source(file)
+
+
 def test_damaged_bag_is_refused(recording: Path, tmp_path: Path) -> None:
     path = bag("ros1", messages(recording, tmp_path), tmp_path)
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(SessionError, match="cannot be read as a bag"):
         open_source(path, load_rig(recording))
+
+
+def test_rig_command_of_a_session_shows_its_rig(recording: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["rig", str(written(recording, tmp_path / "walk.mcap"))])
+    assert done.exit_code == 0, done.stderr
+    assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["pair0", "pair1", "IMU"]

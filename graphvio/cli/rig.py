@@ -31,10 +31,13 @@ def rig(
     """
     from graphvio.errors import RigError
     from graphvio.rig_files import joined_rig, load_rig, save_rig
+    from graphvio.sessions.store import is_store
+    from graphvio.sources.opening import recorded_rig
 
     if out is not None and out.exists():
         raise RigError(f"{out}: exists already; remove it, or choose another name")
-    joined, guessed = joined_rig([load_rig(file) for file in files], files[0].stem if out is None else out.stem)
+    rigs = [recorded_rig(file) if is_store(file) else load_rig(file) for file in files]
+    joined, guessed = joined_rig(rigs, files[0].stem if out is None else out.stem)
     found = _description(joined, guessed)
     publish(found)
     for group in found["groups"]:

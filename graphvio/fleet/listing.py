@@ -8,9 +8,8 @@ from pathlib import Path, PurePosixPath
 
 from graphvio.errors import FleetError
 from graphvio.fleet.storage import file_system, local_path, reaching
+from graphvio.sessions.store import SUFFIXES
 from graphvio.sources import is_recording
-
-_FILES = (".mcap", ".bag")
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,8 @@ def list_sessions(where: str) -> list[Listed]:
     """List the recordings in a folder, one level deep and sorted by name, or those of a text file, in its order.
 
     A list has one path or URL per line; relative paths are relative to the list, and lines that begin with ``#`` are
-    comments. In remote folders each folder counts as a recording, and so does a file that ends in .mcap or .bag.
+    comments. In remote folders each folder counts as a recording, and so does a file that ends in .mcap, .bag
+    or .db3.
 
     Raises:
         FleetError: if it does not exist, or has no recording.
@@ -54,7 +54,7 @@ def _in_remote(url: str) -> list[str]:
     files, path = file_system(url)
     if files.isdir(path):
         found = sorted(files.ls(path, detail=True), key=lambda each: str(each["name"]))
-        names = [str(each["name"]) for each in found if each["type"] == "directory" or each["name"].endswith(_FILES)]
+        names = [str(each["name"]) for each in found if each["type"] == "directory" or each["name"].endswith(SUFFIXES)]
         return [f"{url}/{name.rstrip('/').rpartition('/')[2]}" for name in names]
     parent = url.rpartition("/")[0]
     lines = _lines(files.cat_file(path).decode("utf-8"))
@@ -73,7 +73,7 @@ def _named(recordings: Iterable[str]) -> list[Listed]:
         path = PurePosixPath(recording)
         if path.name == "mav0":
             path = path.parent
-        first = path.stem if path.suffix in _FILES else path.name
+        first = path.stem if path.suffix in SUFFIXES else path.name
         name, number = first, 1
         while name in made:
             number += 1

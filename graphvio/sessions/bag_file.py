@@ -1,4 +1,4 @@
-"""Reads ROS 1 bags, and ROS 2 bags (folders with ``metadata.yaml``), by the ``rosbags`` library, without ROS."""
+"""Reads ROS 1 bags, and ROS 2 bags, folders or SQLite files, by the ``rosbags`` library, without ROS."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ except ImportError:
 
 
 class BagFile(Store):
-    """A bag, ``NAME.bag`` or the folder of a ROS 2 bag.
+    """A bag, ``NAME.bag``, ``NAME.db3`` or the folder of a ROS 2 bag.
 
     Its messages are read as those of ROS 2, of the topics that are wanted. The whole bag is read once for the stamps of
     its messages' headers; messages are read again when they are wanted.

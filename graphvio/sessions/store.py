@@ -8,6 +8,9 @@ from pathlib import Path
 
 from graphvio.sessions.topics import Place, Topic
 
+SUFFIXES = (".mcap", ".bag", ".db3")
+"""Of files that are sessions or bags by themselves: MCAP, ROS 1, and ROS 2 with SQLite."""
+
 
 class Store(ABC):
     """A session or bag, for any number of threads; a `graphvio.sessions.topics.MessageReader`."""
@@ -37,7 +40,7 @@ class Store(ABC):
 
 def is_store(path: Path) -> bool:
     """Return whether a path is a session or a bag."""
-    return path.suffix in (".mcap", ".bag") if path.is_file() else (path / "metadata.yaml").is_file()
+    return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
 
 
 def open_store(path: Path, is_wanted: Callable[[str], bool] = lambda topic: True) -> Store:

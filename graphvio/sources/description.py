@@ -88,8 +88,8 @@ def describe(path: Path) -> Description:
         raise SessionError(f"{path}: does not exist; give a session or bag")
     if not is_store(path):
         raise SessionError(
-            f"{path}: is no session or bag; give NAME.mcap, NAME.bag or the folder of a ROS 2 bag, or convert a "
-            "recording of another layout by graphvio convert"
+            f"{path}: is no session or bag; give NAME.mcap, NAME.bag, NAME.db3 or the folder of a ROS 2 bag, or "
+            "convert a recording of another layout by graphvio convert"
         )
     store = open_store(path)
     logged = [topic.logged_stamps_ns for topic in store.topics.values() if topic.places]

@@ -127,8 +127,8 @@ def layout_of(path: Path) -> Layout:
         instead = meant_instead(path, is_recording)
         names = ", ".join(layout.LAYOUT.partition(":")[0] for layout in _layouts())
         raise SourceError(
-            f"{path}: is no recording that graphvio knows; {instead}give a session or bag (.mcap, .bag), or a folder "
-            f"({names})"
+            f"{path}: is no recording that graphvio knows; {instead}give a session or bag (.mcap, .bag, .db3), or a "
+            f"folder ({names})"
         )
     if next(path.iterdir(), None) is None:
         raise SourceError(f"{path}: is empty; looked for {_known()}")

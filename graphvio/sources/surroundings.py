@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
+from graphvio.sessions.store import SUFFIXES
+
 _MAX_NAMED = 3
 _LEVELS_BELOW = 2  # such as of GROUP/SEQUENCE in a data set; a home folder has too much below
 _LEVELS_ABOVE = 3  # such as of mav0/cam0/data
-_SUFFIXES = (".bag", ".mcap")
+_FILE_OF_BAG = re.compile(r".+_\d+\.(db3|mcap)")  # one of several, as ROS 2 names them
 _CALIBRATIONS = (".yaml", ".yml", ".json")
 _RESULTS = ("summary.json", "report.html", "map.json")  # of run and optimize, calibrate, slam
 
@@ -26,7 +29,7 @@ def recordings_below(path: Path, depth: int, is_recording: Callable[[Path], bool
         yield path
     elif path.is_dir() and depth:
         for below in sorted(path.iterdir()):
-            if (below.is_dir() and not below.name.startswith(".")) or below.suffix in _SUFFIXES:
+            if (below.is_dir() and not below.name.startswith(".")) or below.suffix in SUFFIXES:
                 yield from recordings_below(below, depth - 1, is_recording)
 
 
@@ -56,6 +59,8 @@ def meant_instead(path: Path, is_recording: Callable[[Path], bool]) -> str:
     named = ", ".join(map(str, below[:_MAX_NAMED])) + (", and more" if len(below) > _MAX_NAMED else "")
     if len(below) == 1:
         return f"it holds the recording {named}; give that; "
+    if all(each.parent == path and _FILE_OF_BAG.fullmatch(each.name) for each in below):
+        return f"it holds {named}; if they are one ROS 2 bag, ros2 bag reindex {path} writes its metadata.yaml; "
     return f"it holds {named}; give one of them; "
 
 
