@@ -497,6 +497,28 @@ def test_frameset_in_an_imu_gap_does_not_wait_for_samples(walk: Path) -> None:
     assert "".join(order).startswith("IF" + "FFF")
 
 
+@pytest.mark.parametrize(
+    ("content", "shown"),
+    [
+        (b"\n<!DOCTYPE html>\n<html>Not found, sorry</html>\n", "line 2 is '<!DOCTYPE html>'"),
+        ("#timestamp [ns],filename\n1700000000000000000,a.png\n".encode("utf-16"), "line 1 is "),
+        (bytes(range(128, 256)), "line 1 is "),
+    ],
+    ids=["html", "utf-16", "binary"],
+)
+def test_euroc_table_that_is_none_is_shown(content: bytes, shown: str, tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1, frames=2)
+    table = tmp_path / "mav0" / "cam1" / "data.csv"
+    table.write_bytes(content)
+    with pytest.raises(SourceError, match="cannot be read") as caught:
+        open_source(tmp_path)
+    assert str(table) in str(caught.value)
+    assert shown in str(caught.value)
+    assert "\n" not in str(caught.value)
+    table.unlink()  # the remedy
+    assert open_source(tmp_path).frameset_count == 2
+
+
 def test_first_image_of_another_size_is_refused(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1, frames=2)
     for i in range(2):
@@ -514,7 +536,7 @@ def test_recording_without_a_readable_frameset_is_refused(tmp_path: Path) -> Non
     ):
         list(open_source(tmp_path))
     write_rows(tmp_path / "mav0" / "cam1" / "data.csv", ["#timestamp"])
-    with pytest.raises(SourceError, match="lists no image"):
+    with pytest.raises(SourceError, match="holds no row"):
         open_source(tmp_path)
     write_rows(tmp_path / "mav0" / "cam1" / "data.csv", ["12345"])
     with pytest.raises(SourceError, match="no left image has a right one"):

@@ -63,5 +63,5 @@ def _images(root: Path, camera: str, faults: FaultLog) -> ImageFiles:
         stamps, names = _named_by_stamp(images)
         faults.add(EventKind.CSV_MISSING, 0, f"{csv} does not exist; stamps are taken from the names of the images")
     if not names:
-        raise SourceError(f"{folder}: lists no image in data.csv, and holds none in data/ that is named by its stamp")
+        raise SourceError(f"{folder}: has no data.csv, and no image in data/ that is named by its stamp")
     return ImageFiles(images, stamps, names)

@@ -26,6 +26,7 @@ _HOUR_NS = 3_600_000_000_000
 _MAX_OUTLIERS = 2
 _MIN_STEPS_SHARE = 0.2  # of steps that are not zero: stamps in seconds, read as nanoseconds, are mostly equal
 _MIN_PERIOD_NS, _MIN_ROWS = 20_000, 10  # no camera or IMU is faster than 50 kHz
+_SHOWN = 30  # characters of a line that is not understood
 _FORCE_M_S2 = (5.0, 20.0)
 """Plausible median of the magnitude of specific force: gravity, and what a walk, a car or a drone adds."""
 
@@ -65,13 +66,25 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
 
 
 def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
-    """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and names of the images."""
+    """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and names of the images.
+
+    Raises:
+        SourceError: if it has none, or stamps in another unit.
+    """
 
     def frame(cells: list[str]) -> tuple[int, str] | None:
         stamp = parse_stamp(cells[0])
         return None if stamp is None else (stamp, cells[1] if len(cells) > 1 and cells[1] else f"{stamp}.png")
 
     stamps_ns, names = read_rows(path, _rows(path), frame, EventKind.FRAME_GARBAGE, faults)
+    if not names:
+        first = next(rows_in_lines(path), None)
+        fault = "holds no row" if first is None else f"cannot be read: line {first[0]} is {first[1][:_SHOWN]!r}"
+        raise SourceError(
+            f"{path}: {fault}; expected are lines of a stamp in nanoseconds and an image's name, such as "
+            "1700000000000000000,1700000000000000000.png, as UTF-8 text; correct the file, or remove it to take the "
+            "stamps from the images' names"
+        )
     _refuse_other_units(stamps_ns, path)
     kept = clean_stamps(stamps_ns, "frame", path, faults)
     return stamps_ns[kept], list(compress(names, kept))
