@@ -289,6 +289,16 @@ def test_command_invalid_options_are_refused(walk: Path, arguments: list[str], w
     assert words in str(done.exception)
 
 
+def test_command_existing_output_is_not_overwritten(walk: Path, tmp_path: Path) -> None:
+    out = tmp_path / "rig.yaml"
+    out.write_text("of yesterday")
+    for what in ("pairs", "all"):
+        done = command("calibrate", walk, "--what", what, "--out", out)
+        assert isinstance(done.exception, CalibrationError)
+        assert "exists already" in str(done.exception)
+    assert out.read_text() == "of yesterday"
+
+
 @cache
 def guided(walk: Path) -> tuple[list[Advice], Calibration]:
     source = open_source(walk)

@@ -27,7 +27,11 @@ def calibrate(
     topics: options.Topics = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers next to it.", metavar="FILE"),
+        typer.Option(
+            "--out",
+            help="Write the corrected rig to this new file (.yaml), and all numbers next to it.",
+            metavar="FILE",
+        ),
     ] = None,
     report: options.ReportFolder = None,
     what: Annotated[
@@ -136,7 +140,9 @@ def calibrate_trajectories(
     same_clock: Annotated[
         bool, typer.Option("--same-clock", help="All stamps are of one clock: no offset is estimated.")
     ] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="Write all numbers here (.yaml).", metavar="FILE")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write all numbers to this new file (.yaml).", metavar="FILE")
+    ] = None,
     report: options.ReportFolder = None,
     scale: options.Scale = "auto",
     seed: options.Seed = 0,
@@ -217,6 +223,8 @@ def _check_outputs(out: Path | None, report: Path | None, inputs: list[Path]) ->
             raise CalibrationError(f"--out {out}: is YAML; end its name in .yaml")
         if out.resolve() in [path.resolve() for path in inputs]:
             raise CalibrationError(f"--out {out}: is what is read; name another file")
+        if out.is_file():
+            raise CalibrationError(f"--out {out}: exists already; remove it, or choose another name")
         if out.is_dir() or not out.absolute().parent.is_dir() or not os.access(out.absolute().parent, os.W_OK):
             raise CalibrationError(f"--out {out}: cannot be written; name a file in a folder that exists")
     if report is not None:
