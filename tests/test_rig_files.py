@@ -240,6 +240,12 @@ REFUSED = {
     "same name": (_set("pairs.0.right.name", "cam0"), r"camera 'cam0' appears twice"),
     "imu is no mapping": (_set("imu", 200), r"imu: is 200; it must be a mapping"),
     "offset in ms": (_set("imu.time_offset_s", 12.5), r"time_offset_s is 12\.5"),
+    "pair is a truth value": (_set("pairs.0.name", True), r"pairs\[0\]\.name: is True.*in quotes"),
+    "camera is a truth value": (_set("pairs.0.left.name", False), r"left\.name: is False.*in quotes"),
+    "focal length in mm": (_set("pairs.0.left.intrinsics", [3.0, 3.0, 32.0, 24.0]), r"cam0: a focal length of 3 px"),
+    "view of half a degree": (_set("pairs.0.left.intrinsics", [7e3, 7e3, 32.0, 24.0]), r"cam0: a focal length of 7000"),
+    "principal point": (_set("pairs.0.right.intrinsics", [60.0, 60.0, 32.0, 61.0]), r"cam1: its principal point"),
+    "camera in mm": (_set("pairs.0.right.body_T_cam.0.3", 110.0), r"cam1: is \d+ m from the IMU; .*metres"),
     "negative noise": (_set("imu.gyro_noise_density", -1.0), r"must be positive"),
 }
 
@@ -252,6 +258,29 @@ def test_load_rig_invalid_file_raises(tmp_path: Path, name: str) -> None:
         load_rig(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+def test_load_rig_baseline_in_millimetres_raises(tmp_path: Path) -> None:
+    def edit(document: dict) -> None:  # type: ignore[type-arg]
+        del document["imu"]
+        _set("pairs.0.right.body_T_cam.1.3", 110.0)(document)
+
+    path = edited(tmp_path, edit)
+    with pytest.raises(RigError, match=r"pair pair0: baseline is \d+ m; .*metres"):
+        load_rig(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("pairs.0.left.intrinsics", [60.0, 60.0, 70.0, -10.0]),  # a part of a larger image
+        ("pairs.0.left.intrinsics", [3e3, 3e3, 32.0, 24.0]),  # of a telescope
+        ("pairs.0.right.name", "yes"),
+        ("pairs.0.name", 7),
+    ],
+)
+def test_load_rig_unusual_but_possible_value_is_read(tmp_path: Path, key: str, value: object) -> None:
+    load_rig(edited(tmp_path, _set(key, value)))
 
 
 def test_load_rig_pair_without_baseline_or_common_view_raises(tmp_path: Path) -> None:

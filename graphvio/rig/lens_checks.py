@@ -8,6 +8,8 @@ from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS, EQUIDISTANT, MODEL_NAMES, RADIAL_TANGENTIAL, ray_of
 
 _ROUNDING = 1e-6
+_FOCAL_RANGE = (0.05, 57.3)  # of the image's larger side: from wider than any lens to a view of one degree
+_MAX_OUTSIDE = 0.25  # of the image's side; what remains of a larger image may have its principal point outside
 
 
 def lens_fault(model: str, distortion: Float) -> str:
@@ -32,6 +34,24 @@ def lens_fault(model: str, distortion: Float) -> str:
         return f"xi is {of['xi']:g}, and must be more than -1; {order}"
     if model == "double-sphere" and of["xi"] > 1.0:
         return f"xi is {of['xi']:g}, and must be at most 1; {order}"
+    return ""
+
+
+def intrinsics_fault(focal_px: float, intrinsics: Float, size_px: tuple[int, int]) -> str:
+    """Say which intrinsics are of no lens, such as those in other units than pixels; empty if they are plausible.
+
+    Args:
+        focal_px: scale at the image centre.
+        intrinsics: (4,) pixels.
+        size_px: (width, height).
+    """
+    width, height = size_px
+    cx, cy = intrinsics[2:].tolist()
+    wanted = "intrinsics are fx, fy, cx, cy in this order, in pixels of an image of that size"
+    if not _FOCAL_RANGE[0] <= focal_px / max(size_px) <= _FOCAL_RANGE[1]:
+        return f"a focal length of {focal_px:g} px is of no lens with an image of {width}x{height}; {wanted}"
+    if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > 0.5 + _MAX_OUTSIDE:
+        return f"its principal point ({cx:g}, {cy:g}) is far outside of the image of {width}x{height}; {wanted}"
     return ""
 
 

@@ -5,17 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import FACTORY, CalibrationSigmas
 from graphvio.errors import RigError
 from graphvio.rig.camera import Camera
 from graphvio.rig.groups import CameraGroup, SingleCamera, StereoPair
 from graphvio.rig.imu import Imu
-from graphvio.rig.lens_checks import view_fault
+from graphvio.rig.lens_checks import intrinsics_fault, view_fault
 from graphvio.rig.values import set_value
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+_MAX_DISTANCE_M = 20.0  # of cameras of one rig, and from its IMU
+_IN_METRES = "translations are in metres: if these are in millimetres, divide them by 1000"
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,16 +179,23 @@ class Rig:
 
 
 def checked_views(rig: Rig) -> Rig:
-    """Return a rig that was read from a file, after a test that its lenses reach all of their images.
+    """Return a rig that was read from a file, after a test of what no real one has, such as values in other units.
 
-    Cameras with a mask are not tested: images of a fisheye may have black corners.
+    Lenses must reach all of their images, unless there is a mask: images of a fisheye may have black corners.
 
     Raises:
-        RigError: if one does not.
+        RigError: if a lens does not, its intrinsics are of none, or cameras are tens of metres apart.
     """
     for camera in rig.cameras:
-        if camera.mask is None:
+        fault = intrinsics_fault(camera.focal_px, camera.intrinsics, camera.size_px)
+        if not fault and camera.mask is None:
             fault = view_fault(camera.model, camera.intrinsics, camera.distortion, camera.size_px)
-            if fault:
-                raise RigError(f"camera {camera.name}: {fault}")
+        if fault:
+            raise RigError(f"camera {camera.name}: {fault}")
+        from_imu_m = float(np.linalg.norm(camera.body_T_cam[:3, 3]))
+        if rig.imu is not None and from_imu_m > _MAX_DISTANCE_M:
+            raise RigError(f"camera {camera.name}: is {from_imu_m:.0f} m from the IMU; {_IN_METRES}")
+    for pair in rig.pairs:
+        if pair.baseline_m > _MAX_DISTANCE_M:
+            raise RigError(f"pair {pair.name}: baseline is {pair.baseline_m:.0f} m; {_IN_METRES}")
     return rig

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.rig import Camera, Rig, StereoPair, checked_views
 from graphvio.rig_files.reading import named, read_text
 
 ODOMETRY_FILE = "calib.txt"
@@ -43,7 +43,7 @@ def load_odometry(file: Path) -> Rig:
         )
     with named(file):
         cameras = [_camera(f"image_{i}", _projection(entries, f"P{i}", file), size) for i in (left, right)]
-        return Rig((StereoPair(name, *cameras),), None, folder.resolve().name)
+        return checked_views(Rig((StereoPair(name, *cameras),), None, folder.resolve().name))
 
 
 def load_raw(file: Path, drive: Path | None = None) -> Rig:
@@ -65,7 +65,7 @@ def load_raw(file: Path, drive: Path | None = None) -> Rig:
             size = _floats(entries, f"S_rect_{i:02d}", 2, file)
             projection = _projection(entries, f"P_rect_{i:02d}", file)
             cameras.append(_camera(f"image_{i:02d}", projection, (int(size[0]), int(size[1]))))
-        return Rig((StereoPair(name, *cameras),), None, (drive or file.parent).resolve().name)
+        return checked_views(Rig((StereoPair(name, *cameras),), None, (drive or file.parent).resolve().name))
 
 
 def pair_of(folders: list[str], pattern: str) -> tuple[str, int, int]:

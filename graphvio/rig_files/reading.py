@@ -62,6 +62,8 @@ class Section:
         value = self.get(key)
         if isinstance(value, dict | list):
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be a text")
+        if isinstance(value, bool):
+            raise RigError(f"{self.where(key)}: is {value}, which YAML makes of yes, on, no and off; put it in quotes")
         return str(value)
 
     def number(self, key: str, default: float | None = None) -> float:
