@@ -183,6 +183,11 @@ def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]], tim
     times = times or next((place for place in places if place.is_file()), None)
     if times is None:
         raise TrajectoryError(f"{path}: KITTI poses carry no stamps; give --times FILE, or put times.txt next to them")
+    for number, fields, _ in rows:
+        if len(fields) != _KITTI_COLUMNS:
+            raise TrajectoryError(
+                f"{path}, line {number}: has {len(fields)} columns; KITTI poses have {_KITTI_COLUMNS}"
+            )
     try:
         seconds = times.read_text(encoding="utf-8").split()
         unit = _unit_of(seconds[0]) if seconds else ""
@@ -192,6 +197,8 @@ def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]], tim
         blocks = np.array([[float(field) for field in fields] for _, fields, _ in rows]).reshape(-1, 3, 4)
     except (ValueError, OSError) as error:
         raise TrajectoryError(f"{path}: with {times}: is not numeric ({error}); correct the line") from None
+    if len(stamps) != len(blocks):
+        raise TrajectoryError(f"{path}: has {len(blocks)} poses, and {times} {len(stamps)} stamps; give each pose one")
     poses = np.tile(np.eye(4), (len(blocks), 1, 1))
     poses[:, :3] = blocks
     return Trajectory(np.array(stamps, dtype=np.int64), poses)

@@ -214,6 +214,12 @@ def test_damaged_bag_is_refused(recording: Path, tmp_path: Path) -> None:
         open_source(path, load_rig(recording))
 
 
+def test_rig_command_output_that_is_no_yaml_is_refused(recording: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["rig", str(recording), "--out", str(tmp_path / "rig.txt")])
+    assert isinstance(done.exception, RigError)
+    assert not (tmp_path / "rig.txt").exists()
+
+
 def test_rig_command_of_a_session_shows_its_rig(recording: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["rig", str(written(recording, tmp_path / "walk.mcap"))])
     assert done.exit_code == 0, done.stderr

@@ -144,6 +144,22 @@ def test_load_kitti_with_times_in_nanoseconds_names_the_unit(tmp_path: Path) -> 
         load_trajectory(file)
 
 
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 2 3\n", "line 2: has 3 columns"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "has 1 poses, and .* 2 stamps"),
+    ],
+)
+def test_load_kitti_with_a_wrong_row_names_it(tmp_path: Path, poses: str, message: str) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text(poses)
+    (tmp_path / "times.txt").write_text("0\n1\n")
+    with pytest.raises(TrajectoryError, match=message) as caught:
+        load_trajectory(file)
+    assert str(file) in str(caught.value)
+
+
 def test_load_or_save_unusable_path_raises(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(bytes(range(128, 256)))
     with pytest.raises(TrajectoryError, match="not a text file"):

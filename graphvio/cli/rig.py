@@ -34,6 +34,8 @@ def rig(
     from graphvio.sessions.store import is_store
     from graphvio.sources.opening import recorded_rig
 
+    if out is not None and out.suffix not in (".yaml", ".yml"):
+        raise RigError(f"{out}: is YAML; end its name in .yaml")
     if out is not None and out.exists():
         raise RigError(f"{out}: exists already; remove it, or choose another name")
     rigs = [recorded_rig(file) if is_store(file) else load_rig(file) for file in files]
