@@ -10,7 +10,7 @@ from waves import picture, waves
 from graphvio import FrameSet, Odometry, open_source
 from graphvio.arrays import AnyArray, Image
 from graphvio.evaluation import evaluate
-from graphvio.frontend.image_noise import NoiseFilter, contrast, noise_sigma
+from graphvio.frontend.image_noise import NoiseFilter, has_less_contrast, noise_sigma
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
@@ -34,15 +34,18 @@ def test_noise_sigma_ignores_texture() -> None:
 
 
 def test_contrast_is_that_of_the_textured_blocks() -> None:
-    half_checked = np.where((X < 160) & ((X.astype(int) // 2 + Y.astype(int) // 2) % 2 == 0), 140, 100).astype(np.uint8)
-    assert contrast(half_checked) == pytest.approx(20.0)
-    assert contrast(np.full(X.shape, 100, dtype=np.uint8)) == 0.0
-    assert contrast(np.zeros((8, 8), dtype=np.uint8)) == 0.0  # smaller than a block
+    checked = (X.astype(int) // 2 + Y.astype(int) // 2) % 2 == 0
+    for width, is_textured in ((100, True), (60, False)):  # of 320 pixels: a quarter of the blocks counts
+        image = np.where(checked & (width > X), 140, 100).astype(np.uint8)
+        assert has_less_contrast(image, 19.9) != is_textured
+        assert has_less_contrast(image, 20.1)
+    assert has_less_contrast(np.full(X.shape, 100, dtype=np.uint8), 0.1)
+    assert has_less_contrast(np.zeros((8, 8), dtype=np.uint8), 0.1)  # smaller than a block
 
 
 def test_filter_smooths_both_images_while_one_is_noisy_and_leaves_clean_ones_alone() -> None:
     scene = 128.0 + 45.0 * waves(0.5 * X, 0.5 * Y)
-    texture = contrast(noisy(scene, 0.0, 0))
+    texture = next(sigma for sigma in np.arange(1.0, 60.0, 0.1) if has_less_contrast(noisy(scene, 0.0, 0), sigma))
     noise_filter = NoiseFilter()
     for k, share in enumerate([0.1, 0.17, 0.3, 0.17, 0.1, 0.17]):
         clean, image = noisy(scene, 0.0, k), noisy(scene, share * texture, k)

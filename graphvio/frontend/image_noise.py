@@ -18,15 +18,20 @@ _QUANTILE = 0.5
 _STEP = 6  # pixels and rows from one sample of the noise to the next
 _MAX_RESPONSE = 2047
 _BLOCK_PX, _BLOCK_STEP = 16, 2
-_TEXTURED = 0.75  # quantile of blocks by contrast: corners lie in the better ones
+_MAX_TEXTURED = 0.25  # of the blocks: corners lie in these
 _MIN_TO_SMOOTH, _MIN_TO_GO_ON = 0.2, 0.15  # noise over contrast; sharp images have less than 0.1
 _SMOOTHING_PX = 0.8
 
 
 class NoiseFilter:
-    """Smooths images of the cameras of one pair while their noise is large against what they show."""
+    """Smooths images of the cameras of one pair while their noise is large against what they show.
+
+    Attributes:
+        left_sigma: standard deviation of the noise of the newest left image as it was returned, grey levels.
+    """
 
     def __init__(self) -> None:
+        self.left_sigma = 0.0
         self._is_smoothing = False
 
     def filtered(self, left: Image, right: Image | None) -> tuple[Image, Image | None]:
@@ -36,12 +41,16 @@ class NoiseFilter:
             left: (height, width), or the image of a single camera.
             right: (height, width), or None.
         """
-        images = [image for image in (left, right) if image is not None]
-        least = _MIN_TO_GO_ON if self._is_smoothing else _MIN_TO_SMOOTH
-        self._is_smoothing = any(noise_sigma(image) > least * contrast(image) for image in images)
+        largest = _MIN_TO_GO_ON if self._is_smoothing else _MIN_TO_SMOOTH
+        self.left_sigma = noise_sigma(left)
+        self._is_smoothing = has_less_contrast(left, self.left_sigma / largest) or (
+            right is not None and has_less_contrast(right, noise_sigma(right) / largest)
+        )
         if not self._is_smoothing:
             return left, right
-        return _smoothed(left), None if right is None else _smoothed(right)
+        left = _smoothed(left)
+        self.left_sigma = noise_sigma(left)
+        return left, None if right is None else _smoothed(right)
 
 
 def _smoothed(image: Image) -> Image:
@@ -49,11 +58,16 @@ def _smoothed(image: Image) -> Image:
 
 
 @kernel
-def contrast(image: Image) -> float:
-    """Compute the standard deviation of grey levels within blocks of 16 pixels, of those with the more contrast."""
+def has_less_contrast(image: Image, sigma: float) -> bool:
+    """Whether grey levels deviate by less in blocks of 16 pixels, but for a quarter of them, which may be textured.
+
+    Args:
+        image: (height, width).
+        sigma: standard deviation of the grey levels within a block.
+    """
     height, width = image.shape
     rows, columns, count = height // _BLOCK_PX, width // _BLOCK_PX, (_BLOCK_PX // _BLOCK_STEP) ** 2
-    variances = np.zeros(max(rows * columns, 1))
+    n_others = 0  # blocks with as much contrast, or more
     for j in range(rows):
         for i in range(columns):
             total = squares = 0
@@ -63,9 +77,10 @@ def contrast(image: Image) -> float:
                     total += value
                     squares += value * value
             mean = total / count
-            variances[j * columns + i] = squares / count - mean * mean
-    variances.sort()
-    return float(np.sqrt(variances[int(_TEXTURED * (len(variances) - 1))]))
+            n_others += squares / count - mean * mean >= sigma * sigma
+            if n_others > _MAX_TEXTURED * rows * columns:
+                return False
+    return True
 
 
 @kernel

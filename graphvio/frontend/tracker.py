@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
-from graphvio.frontend.image_noise import NoiseFilter, noise_sigma
+from graphvio.frontend.image_noise import NoiseFilter
 from graphvio.frontend.images import ImageMask, UsablePixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lost_tracks import image_shift, motion_of_found
@@ -62,7 +62,7 @@ class GroupTracker:
         self._left: Pyramid = ()
         self._right: Pyramid = ()
         self._patches = KeyframePatches(group, config.tracking.window_px)
-        self._noise_filter, self._noise_sigma = NoiseFilter(), 0.0
+        self._noise = NoiseFilter()
         self._motion: ReadoutMotion | None = None
 
     def observe(
@@ -88,13 +88,12 @@ class GroupTracker:
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
-        left, right = self._noise_filter.filtered(left, right)
+        left, right = self._noise.filtered(left, right)
         self._left, self._right = build_pyramid(left, levels), () if right is None else build_pyramid(right, 2)
         self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:
             self._matcher.allow(self._usable[1].of(right, masks[1]))
         self._motion = motion if any(camera.line_time_us for camera in self._group.cameras) else None
-        self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths, is_in_view = self._predict(left_T_left_prev)
         pixels, found = self._follow(before, last, guess, is_in_view, left_T_left_prev, left_T_left_keyframe, watch)
@@ -335,7 +334,7 @@ class GroupTracker:
     @property
     def _min_gradient(self) -> float:
         """Smallest rms gradient along a patch's weaker direction; for pure noise it is 0.7 of the noise's deviation."""
-        return min(MIN_GRADIENT, self._noise_sigma)
+        return min(MIN_GRADIENT, self._noise.left_sigma)
 
     def _share_of_cells(self, frame: TrackedFrame, new: Float | None = None) -> float:
         """Compute the share of the image's cells that hold a track with depth, or a new corner (M, 2)."""
@@ -352,7 +351,7 @@ class GroupTracker:
             occupying = np.ones(len(tracked), dtype=bool)  # what is not near yet may turn out to be
         cell_px, border_px = self._cell_px, settings.border_px
         new = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, settings.min_response)
-        admitted = settings.noise_factor * self._noise_sigma
+        admitted = settings.noise_factor * self._noise.left_sigma
         if admitted >= settings.min_response or self._share_of_cells(frame, new) >= settings.scarce_share:
             return new
         tracked, occupying = np.concatenate([tracked, new]), np.concatenate([occupying, np.ones(len(new), dtype=bool)])

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Sequence
-
-import numpy as np
-
-from graphvio.arrays import Float
+from itertools import pairwise
+from math import sqrt
+from statistics import median
 
 _STAMPS = 40
 _MIN_STAMPS = 5
@@ -42,15 +41,17 @@ class StampJitter:
         """Standard deviation of a stamp, seconds; zero where stamps show no period."""
         if self._sigma_s is None:
             errors = [_errors_s(stamps) for stamps in self._stamps.values() if len(stamps) >= _MIN_STAMPS]
-            pooled = np.abs(np.concatenate(errors)) if errors else np.zeros(1)
-            self._sigma_s = float(np.median(pooled)) / (_NORMAL_MEDIAN * np.sqrt(2.0))
+            pooled = [abs(error) for of_group in errors for error in of_group]
+            self._sigma_s = median(pooled or [0.0]) / (_NORMAL_MEDIAN * sqrt(2.0))
         return self._sigma_s
 
 
-def _errors_s(stamps_ns: Sequence[int]) -> Float:
+def _errors_s(stamps_ns: Sequence[int]) -> list[float]:
     """Return by how much intervals between stamps (N,) are not whole periods (N - 1,), zeros if there is no period."""
-    intervals = 1e-9 * np.diff(np.array(stamps_ns))
-    periods = np.maximum(np.round(intervals / np.quantile(intervals, 0.25)), 1.0)
-    period = np.median(intervals / periods)
-    errors = np.asarray(intervals - periods * period)
-    return errors if np.median(np.abs(errors)) < np.sqrt(2.0) * _NORMAL_MEDIAN * _MAX_SHARE * period else 0.0 * errors
+    intervals = [1e-9 * (end - begin) for begin, end in pairwise(stamps_ns)]  # numpy is slow for so few
+    one = sorted(intervals)[len(intervals) // 4]  # some framesets may be missing
+    periods = [max(round(interval / one), 1) for interval in intervals]
+    period = median(interval / count for interval, count in zip(intervals, periods, strict=True))
+    errors = [interval - count * period for interval, count in zip(intervals, periods, strict=True)]
+    is_periodic = median(map(abs, errors)) < sqrt(2.0) * _NORMAL_MEDIAN * _MAX_SHARE * period
+    return errors if is_periodic else [0.0] * len(errors)
