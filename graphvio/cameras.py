@@ -24,6 +24,8 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.kernels import kernel
 
+# The order matters: models below DOUBLE_SPHERE are polynomials (of a point in the plane, or of its angle) or their
+# ratios, those from it on project through a sphere. A new polynomial model must be numbered below DOUBLE_SPHERE.
 RADIAL_TANGENTIAL = 0
 EQUIDISTANT = 1
 RATIONAL = 2
