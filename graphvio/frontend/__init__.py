@@ -1,6 +1,7 @@
 """The visual front-end: images of stereo pairs and single cameras in, relative poses of the rig with covariance out.
 
-It follows sections 2 and 3 of the paper.
+It follows sections 2 and 3 of the paper. In the front-end, `pair`, `pairs` and the index `j` stand for any group,
+single cameras included.
 
 *One pair.* `images` checks images and their masks, and `image_noise` measures their noise. `corners` finds corners
 above it. `prediction` predicts where a motion puts points and how it deforms their patches, and `steady_motion` the

@@ -49,7 +49,7 @@ class Synchroniser:
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
-        self._pairs = len(rig.groups)
+        self._n_groups = len(rig.groups)
         self._has_imu = rig.imu is not None
         self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
         self._nominal_ns = self._offset_ns
@@ -107,7 +107,7 @@ class Synchroniser:
             self._add(confirmed)
 
     def _add(self, frameset: FrameSet) -> None:
-        unknown = [j for j in frameset.images if not 0 <= j < self._pairs]
+        unknown = [j for j in frameset.images if not 0 <= j < self._n_groups]
         if self._newest_ns is not None and frameset.stamp_ns < self._newest_ns + _MIN_INTERVAL_NS:
             if not unknown and self._joins(frameset):
                 held = self._held[-1]
