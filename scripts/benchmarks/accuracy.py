@@ -155,12 +155,12 @@ def _figures(bench: Bench) -> Report:
 
 
 def _figure(outcome: Outcome) -> str:
-    """ATE and drift of a run, or that its trajectory is in several pieces."""
+    """ATE and drift of a run, or that its trajectory has several epochs."""
     if outcome.evaluation is None:
         return "no pose"
     epochs = len(np.unique(outcome.epochs))
     if epochs > 1:
-        return f"lost, {epochs} pieces"
+        return f"lost, {epochs} epochs"
     drift = outcome.evaluation.drift_percent
     return f"{1e3 * outcome.ate_m:.1f} mm" + ("" if drift is None else f", {drift:.2f} %")
 
