@@ -131,7 +131,7 @@ class StateEstimator(Protocol):
         """
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
-        """Predict the state at the next frameset, eq. (11) and (12).
+        """Predict the state at the next frameset, from the IMU or by constant velocity (eq. 11, 12).
 
         Args:
             stamp_ns: Stamp of the frameset.
@@ -156,8 +156,10 @@ class StateEstimator(Protocol):
 
         Args:
             stamp_ns: Stamp of the newest state.
-            is_constrained: Whether vision constrains it, or it has just been initialised.
-            keep: Stamps of states that later motions will be measured from.
+            is_constrained: Whether vision constrains it, or it has just been initialised; `MonocularEstimator` ignores
+                it, since its window shows that.
+            keep: Stamps of states that later motions will be measured from. If `stamp_ns` is among them, the newest
+                frameset is a keyframe; `MonocularEstimator` relies on this.
         """
 
     def finish(self) -> None:

@@ -348,7 +348,10 @@ class Odometry:
 
     @timed("predict")
     def _predict(self, stamp_ns: int) -> _Predicted:
-        """Predict the state at a frameset by the IMU, eq. (11) and (12), or initialise it there."""
+        """Initialise the state at a frameset, or predict it there.
+
+        By preintegration, or without IMU samples by constant velocity (eq. 11, 12).
+        """
         initialisations = self._estimator.initialisations
         if self._imu.begins(stamp_ns):
             self._estimator.initialise(stamp_ns, self._synchroniser.initial_interval(stamp_ns))
