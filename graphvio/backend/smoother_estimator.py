@@ -63,8 +63,8 @@ class SmootherEstimator:
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._accepted = 0  # motions since the initialisation
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
-        self._imu_failed = False  # since the first of these
-        self._is_distrusted = False  # since the first of these, the prediction is known to be wrong
+        self._imu_failed = False  # samples were missing after the first rejected motion
+        self._is_distrusted = False  # the IMU's calibration changed after the first rejected motion
         self._is_imu_left_out = False
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
         self._sigma_m = 0.0  # of the position since vision last constrained it

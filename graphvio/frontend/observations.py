@@ -39,6 +39,7 @@ class RigArrays(NamedTuple):
     @staticmethod
     def of(rig: Rig) -> RigArrays:
         """Collect the arrays of a rig."""
+        # A single camera is stored with its own pose as the right one, see the class.
         return RigArrays(
             np.array([[group.cameras[0].cam_T_body, group.cameras[-1].cam_T_body] for group in rig.groups]),
             np.array([group.left.body_T_cam for group in rig.groups]),

@@ -51,7 +51,9 @@ class Refined:
 
     Attributes:
         cur_T_ref: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant.
+        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant. ``cur_T_ref``
+            is the inverse of `RelativeMotion.reference_T_current`: the perturbation is on the right there, on the left
+            here.
         shared_covariance: (6, 6) the part of it that all motions from the same reference have in common, since they
             depend on the same triangulated points.
         inlier: (N,) the points that it explains.
@@ -113,7 +115,8 @@ def _refined(
         rig: of P pairs.
         observations: N points.
         known: (N,) the inliers; no elements where they are not known.
-        shows_noise: (N,) the others' depth is adapted to nearly any error.
+        shows_noise: (N,) points whose residuals show the noise; the depth of the others is so uncertain that it absorbs
+            their error.
         sigma: pixel noise as it is modelled.
         scale_px: of the Cauchy cost.
         max_error_px: of inliers.
@@ -132,14 +135,14 @@ def _refined(
         is_last = number == _ROUNDS_TO_FIND_INLIERS
         if is_last and not is_known:
             # One pair's images may be blurred or dim: its points are then less certain than the others'.
-            judged = _only(np.ones(len(inlier), dtype=np.bool_), shows_noise)
+            for_noise = _only(np.ones(len(inlier), dtype=np.bool_), shows_noise)
             noise = noise_by_pair(
-                errors2[judged], has_right[judged], observations.pair[judged], len(sigmas_px), largest2
+                errors2[for_noise], has_right[for_noise], observations.pair[for_noise], len(sigmas_px), largest2
             )
             errors2 /= noise[observations.pair]
             sigmas_px *= np.sqrt(noise)
-        judged = _only(inlier if is_known else np.ones(len(inlier), dtype=np.bool_), shows_noise)
-        variance = noise_variance(errors2[judged], has_right[judged], largest2)
+        for_noise = _only(inlier if is_known else np.ones(len(inlier), dtype=np.bool_), shows_noise)
+        variance = noise_variance(errors2[for_noise], has_right[for_noise], largest2)
         if is_known or not is_last:
             scale = _scale(variance, widest)
         # Gross errors are left out as soon as they stand out: near the camera, they would bias the motion more in each
@@ -152,9 +155,9 @@ def _refined(
             pose, rig, blocks, points_at, lane_by_lane(blocks, inlier.astype(np.float64)), sigmas_px, scale,
             _MAX_ROUNDS if is_last else 1, _CONVERGED if is_last else _NEAR,
         )  # fmt: skip
-    judged = _only(inlier, shows_noise)
+    for_noise = _only(inlier, shows_noise)
     covariance, shared = _covariances(
-        pose, hessian, errors2, rig, blocks, points_at, inlier, judged, has_right, sigmas_px, scale
+        pose, hessian, errors2, rig, blocks, points_at, inlier, for_noise, has_right, sigmas_px, scale
     )
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
     return pose, inflation * covariance, inflation * shared, inlier, errors_px
@@ -207,13 +210,13 @@ def _refined_per_image(
 @kernel
 def _covariances(
     pose: Float, hessian: Float, errors2: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints,
-    inlier: Bool, judged: Bool, has_right: Bool, sigmas_px: Float, scale: float,
+    inlier: Bool, for_noise: Bool, has_right: Bool, sigmas_px: Float, scale: float,
 ) -> tuple[Float, Float]:  # fmt: skip
     """Covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`.
 
-    The noise is that of some of the inliers, which are judged.
+    ``for_noise`` are the inliers (N,) from which the noise is estimated.
     """
-    used = influence(errors2[judged], has_right[judged], scale)
+    used = influence(errors2[for_noise], has_right[for_noise], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
     lower = cholesky(information)

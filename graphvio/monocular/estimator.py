@@ -1,7 +1,7 @@
 """State of a rig of single cameras and an IMU: a window of keyframes with landmarks, solved at each frameset.
 
-Scale is part of the state: positions are in metres by the accelerometer, and their covariance has what is not known of
-the scale. Until an `Initialiser` knows it there is no pose.
+Scale is part of the state: positions are in metres by the accelerometer, and their covariance includes the uncertainty
+of the scale. Until an `Initialiser` knows it there is no pose.
 """
 
 from __future__ import annotations

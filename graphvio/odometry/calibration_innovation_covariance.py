@@ -26,17 +26,18 @@ class _Measured(NamedTuple):
     motion: RelativeMotion
     pairs: frozenset[int]
 
-    def is_before(self, motion: RelativeMotion) -> bool:
-        """Whether it is a part of another one."""
+    def has_reference_of(self, motion: RelativeMotion) -> bool:
+        """Whether both motions begin at the same reference."""
         return self.motion.reference_stamp_ns == motion.reference_stamp_ns
 
 
 class CalibrationInnovationCovariance:
     """Adds to motions by vision the covariance by which errors of the calibration make them contradict the IMU.
 
-    The state follows vision, and velocity and biases follow what the errors do. An innovation therefore contains what
-    they add since vision last constrained the state, mostly over one step; but all that they add to a motion by other
-    pairs than those that the state has followed, or by another calibration, since the errors are others.
+    The state follows vision, and velocity and biases absorb the effect of the calibration error. An innovation
+    therefore contains only the error accumulated since vision last constrained the state, usually one step. It contains
+    the whole error if the motion was measured by other pairs, or with another calibration, than the motions the state
+    has followed.
 
     Args:
         rig: To which the covariance of the calibration belongs.
@@ -52,7 +53,7 @@ class CalibrationInnovationCovariance:
         self._tested_by: dict[frozenset[int], RelativeMotion] = {}  # the newest one of each set of pairs
         self._velocity: Float | None = None  # (6,) of body at the newest frameset
         self._velocities: dict[int, Float | None] = {}
-        """The same one frameset before that and before those which motions are measured from."""
+        """Stamp -> body velocity one frameset earlier: of the newest, the references and the last accepted frameset."""
 
     def add_frameset(self, stamp_ns: int, estimator: StateEstimator, references: Set[int], covariance: Float) -> None:
         """Update what the state has followed, by a frameset.
@@ -125,7 +126,11 @@ class CalibrationInnovationCovariance:
         followed = self._followed
         if motion.by_depth_errors is not None:
             by_depth_errors = motion.by_depth_errors
-            if followed is not None and followed.motion.by_depth_errors is not None and followed.is_before(motion):
+            if (
+                followed is not None
+                and followed.motion.by_depth_errors is not None
+                and followed.has_reference_of(motion)
+            ):
                 by_depth_errors = by_depth_errors - followed.motion.by_depth_errors @ se3_adjoint(now_T_since).T
             added = added + self._errors.of_depths(by_depth_errors)
         if followed is not None and followed.pairs != pairs:

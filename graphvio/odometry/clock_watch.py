@@ -26,10 +26,10 @@ _STEP_NS = 190_000_000  # over which a turn is measured; where tracks are too sh
 _MAX_STEP_NS = 500_000_000
 _COMPARED = 25  # newest steps
 _JUDGED_WITHOUT_POSE = 10  # of them: nothing is lost where it is only a door that opens
-_MAX_DISAGREEMENT = 1.0  # of what errors explain: with a right clock it is 0.1, and 0.3 where it is 8 ms off
+_MAX_DISAGREEMENT = 1.0  # median turn difference over its expected error: 0.1 with a right clock, 0.3 at 8 ms of offset
 _MAX_DISAGREEMENT_AT_FIRST = 0.5  # until there are steps enough to be compared
-_MAX_SIGN = 0.3  # beyond which the clock is compared
-_MAX_DIFFERENCE = 0.4  # of a comparison, likewise: it is larger where the clock has jumped between the steps
+_MIN_DISAGREEMENT_TO_SEARCH = 0.3  # above this, other clock shifts are tried; before a pose always
+_MAX_DIFFERENCE = 0.4  # largest RateMatch.difference that is accepted; a clock that jumped between the steps gives more
 _CHECK_NS = 250_000_000  # from one comparison to the next
 _SAME_S = 0.005  # of two comparisons
 _MIN_SHIFT_S = 0.015  # that ends an epoch; less is the calibration's
@@ -76,7 +76,7 @@ class ClockWatch:
             return False
         readings = self._synchroniser.mean_readings()
         disagreement = turn_disagreement(list(self._steps)[-judged:], readings)
-        is_good = disagreement is None or disagreement < _MAX_SIGN
+        is_good = disagreement is None or disagreement < _MIN_DISAGREEMENT_TO_SEARCH
         shift_s = None
         if stamp_ns >= self._next_ns and not (has_pose and is_good and not self._is_beyond):
             self._next_ns = stamp_ns + _CHECK_NS

@@ -24,7 +24,7 @@ _MAX_STEP_NS = 500_000_000  # between framesets whose rotation is compared
 _CHECK_NS = 1_000_000_000  # from one comparison to the next
 _FIRST_WAIT_NS = 1_000_000_000  # until the first one; four times as long each time
 _MAX_WAIT_NS = 60_000_000_000
-_TRUSTED_AGAIN = 10  # waits that it was right for, after which the next one is as short as the first
+_TRUSTED_AGAIN = 10  # if the IMU was right for this many waits, the next wait has the first value again
 _MIN_INLIERS = 20
 _MAX_WITNESSES = 2  # pairs that see the same motion: what misleads one of them does not mislead the other
 _MIN_SHIFT_S = 0.005  # less is the calibration's
@@ -84,8 +84,8 @@ class ImuWatch:
             is_applied: Whether the state has been updated by a motion of vision.
 
         Returns:
-            How the IMU moves where it is used again, maybe by another clock: what the state has of its errors no longer
-            holds. Else None.
+            The match if the IMU is used again from now on, possibly with a corrected clock; the biases in the state are
+            then no longer valid. None otherwise.
         """
         step_ns, self._before_ns = stamp_ns - self._before_ns, stamp_ns
         motion = visual.motion if visual.quality is Quality.GOOD else None

@@ -32,7 +32,8 @@ class NavFrame:
         Args:
             stamp_ns: Of the first estimate that it applies to.
             estimator_T_body: (4, 4) newest pose in the estimator's frame.
-            old_R_new: (3, 3) the attitude of the body frame to come in the one until now.
+            old_R_new: (3, 3) rotation of the corrected body frame relative to the previous one, with the first pair's
+                left camera held fixed.
 
         Returns:
             (6,) tangent ``[rotation, translation]`` of the pose's change, in body.

@@ -381,6 +381,7 @@ class Odometry:
     @timed("update")
     def _update(self, predicted: _Predicted, applied: MeasurementUpdate) -> Status:
         """Solve for the state, and drop the tracks that it shows to move."""
+        # `keyframe_of` asks for the motion since the previous keyframe, so its state must stay in the window.
         previous_keyframe = set() if self._keyframe_ns is None else {self._keyframe_ns}
         update = self._estimator.update(
             predicted.stamp_ns,

@@ -75,8 +75,9 @@ class OnlineCalibration(Protocol):
             stamp_ns: Of the frameset, for events.
 
         Returns:
-            (3, 3) attitude ``old_R_new`` of the body frame to come in the one until now, as the first pair has it; None
-            where that stays, and after a knock: then the cameras have turned in body, and not the body.
+            (3, 3) rotation ``old_R_new`` of the corrected body frame relative to the previous one, with the first
+            pair's left camera held fixed. None if it does not change, or after a knock, which turns the cameras and not
+            body.
         """
 
     def correct_pose(self, turned: Float) -> None:

@@ -29,8 +29,8 @@ from graphvio.self_calibration.parameters import n_of_cameras
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
 _MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
-_MAX_TURN_RAD = np.deg2rad(0.3)  # of the cameras in body, up to which motions are measured from references as before
-_DISTRUST_SIGMAS = 5.0  # by which the IMU's calibration changes: what was predicted by the one before is wrong
+_MAX_TURN_RAD = np.deg2rad(0.3)  # a larger correction of the cameras' attitude begins a new keyframe
+_DISTRUST_SIGMAS = 5.0  # if an IMU parameter changes by more than this, predictions made before are wrong
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
 
 
@@ -98,7 +98,7 @@ class PairsCalibration:
             self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
 
     def restart_imu(self) -> None:
-        """Discard the window that is not full: it has samples of before."""
+        """Discard the unfinished window: it contains samples from before the restart."""
         self._calibration.restart_imu()
 
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:

@@ -1,4 +1,4 @@
-"""The calibration of a rig of single cameras: the estimator's window knows it, and passes it on by way of this."""
+"""The calibration of a rig of single cameras, passed on from the estimator's window."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class SinglesCalibration:
         """Do nothing: `update` asks for no change of the pose."""
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
-        """Return zero: the state's covariance has what errors of the calibration do."""
+        """Return zero: the state's covariance already includes errors of the calibration."""
         return np.zeros((6, 6))
 
     def close(self) -> None:

@@ -40,7 +40,7 @@ class Gaussian(NamedTuple):
         return float(0.5 * off @ self.information @ off)
 
     def is_confirmed_by(self, posterior: Gaussian) -> bool:
-        """Return whether a posterior of this fits it, with a margin for errors that are not modelled."""
+        """Return whether the posterior mean is within this prior: squared Mahalanobis distance below 3 a parameter."""
         return 2.0 * self.cost(posterior.mean) < _MAX_MEAN_INNOVATION * len(self.mean)
 
 
@@ -74,7 +74,7 @@ class FilePrior(NamedTuple):
 
     def of_each(self, factors: Float) -> Float:
         """Return each parameter's factor (C,), of the groups' factors (G,)."""
-        return np.asarray(np.append(factors, 1.0)[self.group])
+        return np.asarray(np.append(factors, 1.0)[self.group])  # group -1, without a factor, selects the appended 1.0
 
 
 class Evidence(NamedTuple):
@@ -125,7 +125,8 @@ class Evidence(NamedTuple):
 
         Args:
             prior: of the calibration.
-            min_gains: (G,) twice the logarithm of the likelihood ratio from which a group of the file is not exact.
+            min_gains: (G,) threshold on twice the log likelihood ratio against an exact file, above which a group is
+                taken to be inexact.
             likelihood: of the same evidence and prior, if there is one already.
 
         Returns:

@@ -11,7 +11,7 @@ from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_
 from graphvio.self_calibration.parameters import about_origin, depths_of_pair, extrinsics_of, n_of_cameras
 from graphvio.self_calibration.prior import extrinsic_covariances
 
-_ERROR_SHARE = 0.2  # of what wrong depths do, in all directions: errors away from the middle of the image do otherwise
+_ERROR_SHARE = 0.2  # isotropic share added, since depth errors away from the image centre act in other directions
 
 
 class InnovationErrors:

@@ -207,7 +207,8 @@ class SelfCalibration:
         except np.linalg.LinAlgError:
             return False  # measurements that determine nothing
         except RigError:
-            return False  # an IMU that is no IMU of any rig: its measurements are wrong
+            # The estimated IMU parameters are outside what Imu accepts, so the IMU's measurements must be wrong.
+            return False
         prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
         if not solution.has_converged:
             return False
@@ -335,7 +336,7 @@ class SelfCalibration:
         covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n_cameras, :n_cameras]
         extrinsics = {}
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
-        _ = estimate.rig  # raises where there is no such rig
+        _ = estimate.rig  # build the rig now: it raises RigError here rather than later in the odometry's thread
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
             extrinsics = extrinsic_covariances(self._rig, anywhere.covariance)
