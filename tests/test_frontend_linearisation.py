@@ -87,7 +87,7 @@ def moved(step: Float, cur_T_ref: Float) -> Float:
 
 
 def by_motion(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Float:
-    """Derivative (4 or 2, 6) of a point's predicted pixels by a step of the motion."""
+    """Derivative (4 or 2, 6) of a point's predicted pixels with respect to a step of the motion."""
     h = 1e-6 * np.eye(6)
     return np.column_stack(
         [
@@ -99,7 +99,7 @@ def by_motion(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Flo
 
 
 def by_point(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Float:
-    """Derivative (4 or 2, 3) of a point's predicted pixels by the point."""
+    """Derivative (4 or 2, 3) of a point's predicted pixels with respect to the point."""
     h = 1e-7 * np.eye(3)
     return np.column_stack(
         [

@@ -176,7 +176,7 @@ def right_view(pair: StereoPair) -> tuple[Float, int, Float, Float]:
 
 
 def slopes(pair: StereoPair, at: Float) -> Float:
-    """What stereo matching would measure on the wall: the shift's derivative by the left pixel."""
+    """What stereo matching would measure on the wall: the shift's derivative with respect to the left pixel."""
     rays = unprojected(at, pair.left)
     direction, measured = along(pair, rays, on_wall(rays)), np.empty((len(at), 2))
     for k, step in enumerate(np.eye(2)):

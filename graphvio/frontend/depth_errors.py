@@ -21,7 +21,7 @@ _WEAKEST_SIGMA = 1e3  # radians and metres over pixels, of directions that no po
 
 @kernel
 def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cur_T_ref: Float) -> Float:
-    """Return the derivatives of a motion by errors of the pairs' depths.
+    """Return the derivatives of a motion with respect to errors of the pairs' depths.
 
     They are those of the least squares solution on the inliers, where only depths at the reference are uncertain
     besides the pixels now: within about a third of those of the refined motion.
@@ -33,8 +33,9 @@ def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cu
         cur_T_ref: (4, 4) the motion.
 
     Returns:
-        (P, 2, 6) by an offset of all inverse depths of a pair, 1/m, and by a share of them; tangent ``[rotation,
-        translation]`` in the body frame at the current instant. Zero for single cameras and pairs without points.
+        (P, 2, 6) with respect to an offset of all inverse depths of a pair, 1/m, and to a share of them; tangent
+        ``[rotation, translation]`` in the body frame at the current instant. Zero for single cameras and pairs without
+        points.
     """
     n_pairs, motions = len(rig.focal_px), camera_motions(cur_T_ref, rig)
     information, derivatives = np.eye(6) / _WEAKEST_SIGMA**2, np.zeros((n_pairs, 2, 6))
@@ -82,14 +83,14 @@ def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cu
 def _add_image(
     rig: RigArrays, motions: Float, j: int, side: int, point: Float, columns: Float, by_depth: Float
 ) -> float:
-    """Fill derivatives of a point's pixel in one image by the motion and by its inverse depth at the reference.
+    """Fill derivatives of a point's pixel in one image with respect to the motion and its inverse depth.
 
     Args:
         rig: P pairs and single cameras.
         motions: (P, 2, 4, 4) of these, see `camera_motions`.
         j: The pair.
         side: Its image.
-        point: (3,) ``[x, y, 1/Z]`` at the reference.
+        point: (3,) ``[x, y, 1/Z]`` at the reference, where the inverse depth is.
         columns: (4, 8) output; the image's rows and the columns (6,) of the motion.
         by_depth: (4,) output, likewise.
 

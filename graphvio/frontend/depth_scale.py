@@ -5,7 +5,8 @@ Taken for independent errors of its points, they would let yesterday's length of
 of the tracks add up to a scale that pairs know better. So the scale of each single camera's depths is one more unknown.
 
 A factor ``1 + s`` of all inverse depths of a camera changes what it sees as a translation of the camera that is longer
-by that factor does: the derivative by s is that by the motion, along the direction d of the camera's translation.
+by that factor does: the derivative with respect to s is that with respect to the motion, along the direction d of the
+camera's translation.
 """
 
 from __future__ import annotations
@@ -144,7 +145,7 @@ def with_scale_of_depths(rig: RigArrays, single: int, motion: Refined) -> Refine
 
 
 def _along_translation(rig: RigArrays, single: int, cur_T_ref: Float) -> Float:
-    """Return the derivative (6,) of the motion of body by a factor of a camera's translation."""
+    """Return the derivative (6,) of the motion of body with respect to a factor of a camera's translation."""
     body_T_cam = np.ascontiguousarray(rig.body_T_left[single])
     translation = (se3_inverse(body_T_cam) @ cur_T_ref @ body_T_cam)[:3, 3]
     return np.asarray(se3_adjoint(body_T_cam)[:, 3:] @ translation)

@@ -62,7 +62,7 @@ class ExtrinsicMonitor:
         return np.eye(4) if self.in_force is None else se3_exp(self.in_force.tangent)
 
     def add(self, trusted: Refined, pair: Refined) -> None:
-        """Take two motions over the same keyframe, the pair's computed with the correction in force."""
+        """Add two motions over the same keyframe, the pair's computed with the correction in force."""
         correction = self.correction
         uncorrected = se3_inverse(correction) @ pair.cur_T_ref @ correction
         whitener = np.linalg.inv(np.linalg.cholesky(trusted.covariance + pair.covariance))
@@ -167,7 +167,7 @@ def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
 def _linearised(correction: Float, trusted: Float, pairs: Float, whiteners: Float) -> tuple[Float, Float]:
     """Return whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and derivatives.
 
-    These (N, 6, 6) are by one more correction from the left.
+    These (N, 6, 6) are with respect to one more correction from the left.
     """
     n = len(trusted)
     errors, derivatives = np.empty((n, 6)), np.empty((n, 6, 6))

@@ -42,7 +42,7 @@ class RigExtrinsics:
         return {j: monitor.in_force for j, monitor in self._monitors.items() if monitor.in_force is not None}
 
     def recalibrate(self, rig: Rig, uncertain: Mapping[int, Float]) -> None:
-        """Take another calibration of the cameras, and covariances (6, 6) relative to the first pair's extrinsics."""
+        """Use another calibration of the cameras, and covariances (6, 6) relative to the first pair's extrinsics."""
         self._nominal = RigArrays.of(rig)
         self.arrays = self._nominal
         self.uncertain = uncertain

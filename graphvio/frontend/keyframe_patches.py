@@ -38,12 +38,12 @@ class KeyframePatches:
         self._inverse_depths: Float = np.zeros((5, 0))
 
     def take(self, frame: TrackedFrame, image: Image) -> None:
-        """Take the patches of a frame's tracks, from its left image (height, width)."""
+        """Store the patches of a frame's tracks, from its left image (height, width)."""
         self._image = packed(image)
         self._place(frame)
 
     def recalibrate(self, group: CameraGroup) -> None:
-        """Take another calibration of the cameras."""
+        """Use another calibration of the cameras."""
         self._group = group
         self._place(self._frame.recalibrated(group))
 
@@ -68,7 +68,7 @@ class KeyframePatches:
         )
 
     def slant(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
-        """Take the depth of patches of a single camera, and their slant, as another camera sees them.
+        """Set the depth of patches of a single camera, and their slant, as another camera sees them.
 
         Args:
             found: tracks of the keyframe, matched in the other camera.

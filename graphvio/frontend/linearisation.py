@@ -96,7 +96,7 @@ def _relinearise_block(
     for i in range(POINTS):
         shift = shifts[X + i], shifts[Y + i], shifts[W + i]
         point = block[X + i] + shift[0], block[Y + i] + shift[1], block[W + i] + shift[2]
-        # Derivatives of the four coordinates by the point, and their errors; zero where there is no right image.
+        # Derivatives of the four coordinates with respect to the point, and their errors; zero without a right image.
         ja, jb, ra, rb = derivatives_by_point(left, point, focal_left, block[LEFT_U + i], block[LEFT_V + i])
         jd, je, rd, re = derivatives_by_point(
             right, point, block[SEEN + i] * focal_right, block[RIGHT_U + i], block[RIGHT_V + i]

@@ -131,7 +131,7 @@ def register(
         source: image that holds the patches, as of `graphvio.frontend.patches.packed`.
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
-        warps: (N, 2, 2) derivative of the source pixel by the target pixel.
+        warps: (N, 2, 2) derivative of the source pixel with respect to the target pixel.
         guess: (N, 2) in the target.
         wanted: (N,) which patches to find.
         half: of the patch's side, without its middle.

@@ -36,7 +36,7 @@ class StereoMatches:
         right_pixels: (N, 2) the same, in pixels.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
-        slopes: (N, 2) derivative of the shift along the epipolar line by the left pixel.
+        slopes: (N, 2) derivative of the shift along the epipolar line with respect to the left pixel.
         good: (N,) whether the match passed all tests; elsewhere the other values mean nothing.
         rejected: test -> number of corners that failed it, of those that had passed the tests before it.
     """
@@ -82,7 +82,7 @@ class StereoMatcher:
         self._allowed = allowed_right
 
     def recalibrate(self, pair: TwoCameras, epipolar_margin_px: float) -> None:
-        """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
+        """Use another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair
         self._margin_px = epipolar_margin_px
         self._shift_px = np.zeros(2)

@@ -65,7 +65,7 @@ class MotionHistory:
         self._since = since | self._since
 
     def recalibrate(self, new_T_old: Float) -> None:
-        """Take another body frame (4, 4), in which the cameras' motions are the same and body's are others."""
+        """Use another body frame (4, 4), in which the cameras' motions are the same and body's are others."""
         old_T_new, adjoint = se3_inverse(new_T_old), se3_adjoint(np.ascontiguousarray(new_T_old))
         self._since = {
             ns: Since(new_T_old @ each.cur_T_then @ old_T_new, adjoint @ each.covariance @ adjoint.T, each.keyframes)
@@ -91,7 +91,7 @@ class FirstSights:
         self._rays: Float = np.zeros((0, 2))
 
     def recalibrate(self, then: Camera, now: Camera) -> None:
-        """Take another calibration of the camera, by which the same pixels have other normalised coordinates."""
+        """Use another calibration of the camera, by which the same pixels have other normalised coordinates."""
         pixels, is_seen = then.project(np.column_stack([self._rays, np.ones(len(self._rays))]))
         rays, has_ray = now.unproject(pixels)
         self._rays = np.where((is_seen & has_ray)[:, None], rays, self._rays)

@@ -49,7 +49,7 @@ class PairPoints(NamedTuple):
 
     @staticmethod
     def of(pair: StereoPair, observations: Observations) -> PairPoints:
-        """Take one pair's observations, without their covariances, which eq. (2) does not use."""
+        """Return one pair's observations, without their covariances, which eq. (2) does not use."""
         x, y, inverse_depth = observations.points.T
         return PairPoints(
             np.column_stack([x, y, np.ones_like(x), inverse_depth]),

@@ -38,7 +38,7 @@ def project(m: Matrix, point: Vector) -> tuple[float, float, float, bool]:
 def derivatives_by_point(
     m: Matrix, point: Vector, focal_px: float, at_u: float, at_v: float
 ) -> tuple[Vector, Vector, float, float]:
-    """Compute the derivatives of a point's coordinates in one image by ``[x, y, 1/Z]``, and their errors, pixels."""
+    """Compute derivatives of a point's coordinates in one image with respect to ``[x, y, 1/Z]``, and errors, pixels."""
     u, v, z, _ = project(m, point)
     scale = focal_px / z
     return (
@@ -53,7 +53,7 @@ def derivatives_by_point(
 def derivatives_by_motion(
     m: Matrix, cam_T_body: Matrix, focal_px: float, point: Vector, at_u: float, at_v: float
 ) -> tuple[Row, Row, bool]:
-    """Compute the derivatives of a point's two coordinates in one image by ``d`` in ``exp(d) cur_T_ref``, pixels.
+    """Compute derivatives of a point's coordinates in one image with respect to ``d`` in ``exp(d) cur_T_ref``, pixels.
 
     Returns:
         The derivatives of each coordinate with its error as last element; and whether the point is in front of the

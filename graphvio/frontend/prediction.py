@@ -58,8 +58,8 @@ def predict_warps(
         distortion: (8,) of the camera.
 
     Returns:
-        Derivatives (N, 2, 2) of the pixel before by the pixel after; the shift (N, 2) of the affine map's centre from
-        the point, in the image before, pixels; and whether both exist (N,).
+        Derivatives (N, 2, 2) of the pixel before with respect to the pixel after; the shift (N, 2) of the affine map's
+        centre from the point, in the image before, pixels; and whether both exist (N,).
     """
     n = inverse_depths.shape[1]
     warps, shifts, valid = np.zeros((n, 2, 2)), np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)

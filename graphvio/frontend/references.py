@@ -34,11 +34,11 @@ class References:
         return self._frames.get(pair)
 
     def replace(self, frames: Mapping[int, TrackedFrame]) -> None:
-        """Take frames as their pairs' references from now on."""
+        """Use frames as their pairs' references from now on."""
         self._frames.update(frames)
 
     def recalibrate(self, rig: Rig) -> None:
-        """Take another calibration of the rig: the references' points are triangulated again."""
+        """Use another calibration of the rig: the references' points are triangulated again."""
         self._frames = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._frames.items()}
 
     def clear(self) -> None:

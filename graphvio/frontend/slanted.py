@@ -32,7 +32,7 @@ _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 g
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 _Columns = tuple[Patch, Patch, Patch, Patch]
-"""A patch's derivatives by the shift and by the slopes."""
+"""A patch's derivatives with respect to the shift and the slopes."""
 
 
 @fast_kernel
@@ -49,7 +49,7 @@ def align_slanted(
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) initial pixels in the right image.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
-        slopes: (N, 2) initial slopes: derivative of the shift along the line by the left pixel.
+        slopes: (N, 2) initial slopes: derivative of the shift along the line with respect to the left pixel.
         known: (N,) whether guess and slopes are known from before; elsewhere the patch is first shifted alone.
         wanted: (N,) which patches to align.
         half: of the patch's side, without its middle.
@@ -100,7 +100,7 @@ def align_slanted(
 
 @fast_kernel
 def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) -> None:
-    """Fill the derivatives by the slopes, of zero mean, from those by the shift."""
+    """Fill the derivatives with respect to the slopes, of zero mean, from those with respect to the shift."""
     gx, gy, by_x, by_y = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
     xs, ys, inside = grid.columns.flat, grid.rows.flat, grid.inside.flat
     along_x, along_y, area = np.float32(ex), np.float32(ey), np.float32(len(grid.rows.rows) ** 2)

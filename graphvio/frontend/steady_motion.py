@@ -30,7 +30,7 @@ class SteadyMotion:
         return None if then is None else se3_inverse(self._nav_T_now) @ then
 
     def end(self, motion: RelativeMotion | None) -> None:
-        """Take the measured pose; without one, the prediction stands."""
+        """End the step at the measured pose; without one, at the predicted pose."""
         if motion is not None and motion.reference_stamp_ns in self._nav_T_body:
             self._nav_T_now = self._nav_T_body[motion.reference_stamp_ns] @ motion.reference_T_current
         if self._latest_ns is not None:

@@ -200,7 +200,7 @@ def triangulate(
                 points[i, 0], points[i, 1], points[i, 2] = a, b, w
                 errors[i] = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3)
                 break
-            # derivatives of (u, v) in pixels by a, b, w
+            # derivatives of (u, v) in pixels with respect to a, b, w
             ua, ub, uw = (
                 scale * (r[0, 0] - u * r[2, 0]), scale * (r[0, 1] - u * r[2, 1]), scale * (r[0, 3] - u * r[2, 3]),
             )  # fmt: skip

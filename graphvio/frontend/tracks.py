@@ -30,8 +30,8 @@ class TrackedFrame:
         right_pixels: (N, 2) in the right image; meaningful where ``has_depth``.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.stereo`.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
-        slopes: (N, 2) derivative of the disparity by the left pixel (u, v) over the patch, as the slant of the surface
-            makes it, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
+        slopes: (N, 2) derivative of the disparity with respect to the left pixel (u, v) over the patch, as the slant of
+            the surface makes it, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
         has_depth: (N,) whether the stereo match passed all its tests.
         frames_without_depth: (N,) number of frames since the last valid stereo match, 0 where this one has it.
         is_single: whether the camera has no partner: every track has a depth, though it may be next to unknown.

@@ -91,7 +91,7 @@ def _warped_search(
         right: likewise.
         pixels: (N, 2) corners in the left image.
         rays: (N, 2) their normalised coordinates.
-        warps: (N, 2, 2) derivative of the left pixel by the right pixel.
+        warps: (N, 2, 2) derivative of the left pixel with respect to the right pixel.
         nearest: largest inverse depth, 1/m.
         right_T_left: (4, 4).
         model: number of the right camera's model.
