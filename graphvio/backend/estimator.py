@@ -111,7 +111,7 @@ class StateEstimator(Protocol):
         """Return stamps and poses ``nav_T_body`` that became final since the last call, not always in time order."""
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
-        """Take an IMU sample, if single ones are needed beside the intervals between framesets.
+        """Add an IMU sample, if single ones are needed beside the intervals between framesets.
 
         Args:
             stamp_ns: On the framesets' clock.
@@ -175,7 +175,7 @@ class ImuFaultTolerant(Protocol):
     """
 
     def leave_imu_out(self) -> None:
-        """Take note that the IMU is not used until `use_imu_again`: the initialisation no longer waits for it."""
+        """Record that the IMU is not used until `use_imu_again`: the initialisation no longer waits for it."""
 
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
         """Use the IMU again: keep the newest pose, and take biases and gravity from a comparison with vision.
@@ -186,7 +186,7 @@ class ImuFaultTolerant(Protocol):
         """
 
     def distrust_prediction(self) -> None:
-        """Take the refused motions for right and the prediction for wrong: the IMU's calibration has been corrected.
+        """Record that the prediction is wrong and refused motions are right: the IMU's calibration was corrected.
 
         Biases and attitude have followed wrong samples, so that the next reinitialisation gives them wide priors.
         """

@@ -69,7 +69,7 @@ class ImuBuffer:
         return int(self._stamps[self._end - 1]) if self._end > self._first else None
 
     def add(self, sample: ImuSample) -> str:
-        """Take a sample, and return the kind of its fault if it is unusable, or an empty string."""
+        """Add a sample, and return the kind of its fault if it is unusable, or an empty string."""
         fault = value_fault(sample)
         if fault:
             return fault

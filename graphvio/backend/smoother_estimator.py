@@ -133,7 +133,7 @@ class SmootherEstimator:
     # ------------------------------------------------------------------ one frameset
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
-        """Take no single samples: the intervals between framesets have them."""
+        """Do nothing: the intervals between framesets have the samples."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Make a smoother with one state, at the newest position if there is one, which then ends the epoch."""
@@ -288,7 +288,7 @@ class SmootherEstimator:
         return MeasurementUpdate(None)
 
     def _add_refused(self, motion: RelativeMotion) -> None:
-        """Take note of the pose that a motion leads to, from a state or from where motions before it led to."""
+        """Record the pose that a refused motion leads to, from a state or from the pose that earlier ones led to."""
         reference_ns = motion.reference_stamp_ns
         nav_T_reference = self._refused.get(reference_ns)
         if nav_T_reference is None:
@@ -343,7 +343,7 @@ class SmootherEstimator:
         )
 
     def _reinitialise_from_vision(self, motion: RelativeMotion, why: str) -> None:
-        """Take the pose from refused motions that go on agreeing with each other: the prediction is at fault.
+        """Reinitialise at the pose by refused motions that go on agreeing with each other: the prediction is at fault.
 
         Their chain begins at a state that was accepted. Unless the IMU is known to have failed at that moment, or was
         corrected wrongly, the pose is uncertain by as much as it differs from the prediction.
@@ -397,7 +397,7 @@ class SmootherEstimator:
         self._note_accepted()
 
     def _note_accepted(self) -> None:
-        """Take note that vision is accepted: nothing is refused any more, and the estimate is not lost."""
+        """Record that vision is accepted: nothing is refused any more, and the estimate is not lost."""
         self._refused.clear()
         self._imu_failed = self._is_distrusted = False
         self._status.is_lost = False

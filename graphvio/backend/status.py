@@ -35,7 +35,7 @@ class StatusMonitor:
         self._is_reported = False  # that initialisation takes long
 
     def note_initialisation(self, initial: InitialState) -> None:
-        """Take note of an initialisation: without a standstill, the first motions have to complete it."""
+        """Record an initialisation: without a standstill, the first motions have to complete it."""
         if not initial.is_known:
             self._initialising_since_ns, self._was_complete, self._is_reported = initial.stamp_ns, False, False
 

@@ -72,7 +72,7 @@ class TimeOffsetFilter:
         return OffsetEstimate(float(self._mean[0]), float(np.sqrt(self._covariance[0, 0])))
 
     def update(self, motion: RelativeMotion) -> None:
-        """Take the relative motion of a frameset."""
+        """Update the estimate by the relative motion of a frameset."""
         reference_ns = motion.reference_stamp_ns
         start = self._beginnings.get(reference_ns)
         start_ns = reference_ns if start is None else start.stamp_ns
@@ -148,9 +148,9 @@ def _own_rotation_covariance(motion: RelativeMotion) -> Float:
 
 @kernel
 def integrated_rates(steps_s: Float, rates: Float) -> tuple[Float, Float]:
-    """Return the rotation (3, 3) over steps of constant rate (N, 3), and its derivative (3, 3) by their bias.
+    """Return the rotation (3, 3) over steps of constant rate (N, 3), and its derivative with respect to their bias.
 
-    The derivative is that of the rotation's tangent in the frame at the end.
+    The derivative (3, 3) is that of the rotation's tangent in the frame at the end.
     """
     start_R_end, by_bias = np.eye(3), np.zeros((3, 3))
     for i in range(len(steps_s)):

@@ -130,7 +130,7 @@ class FilterEstimator:
     # ------------------------------------------------------------------ one frameset
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
-        """Take no single samples: the intervals between framesets have them."""
+        """Do nothing: the intervals between framesets have the samples."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Make a filter with a first state, at the newest position if there is one, which then ends the epoch."""

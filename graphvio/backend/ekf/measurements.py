@@ -24,7 +24,7 @@ class Measurement:
     Attributes:
         name: Name of the sensor.
         innovation: (M,) measured minus expected value.
-        by_error: (M, 15) measurement Jacobian H: derivative of the expected value by the state's error.
+        by_error: (M, 15) measurement Jacobian H: derivative of the expected value with respect to the state's error.
         covariance: (M, M) of the noise.
     """
 

@@ -39,8 +39,8 @@ def jacobians(state: FilterState, dt: float) -> tuple[Float, Float]:
     """Return the state-transition Jacobian F (15, 15) and the noise Jacobian G (15, 9) of a step, eq. (11) and (12).
 
     The motion of the step, eq. (12), is ``x_rel = (v + n_v) dt`` in body and ``rho_rel = (omega + n_omega) dt``. The
-    blocks of position by velocity and by ``n_v`` are the derivatives through ``x_rel``, those of attitude by rate and
-    by ``n_omega`` through ``rho_rel``. The same noise changes the velocities.
+    blocks of position with respect to velocity and ``n_v`` are the derivatives through ``x_rel``, those of attitude
+    with respect to rate and ``n_omega`` through ``rho_rel``. The same noise changes the velocities.
     """
     by_error, by_noise = np.eye(ERRORS), np.zeros((ERRORS, NOISES))
     turned = so3_right_jacobian(state.rate_body * dt) * dt
