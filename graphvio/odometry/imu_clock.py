@@ -72,7 +72,7 @@ class ImuClock:
         return True
 
     def keep(self) -> None:
-        """Take note that the clock is right as it is corrected now."""
+        """Record that the clock is right as it is corrected now."""
         self.shift_s, self.is_too_late = self._corrected_s, False
 
     @property

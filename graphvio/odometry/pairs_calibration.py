@@ -91,7 +91,7 @@ class PairsCalibration:
         self._calibration.on_full_window = on_window
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Take an IMU sample; the first ones show the force at which scale and axes may be wrong."""
+        """Add an IMU sample; the first ones show the force at which scale and axes may be wrong."""
         self._calibration.add_sample(sample)
         if self._averaged < _AVERAGED:
             self._averaged += 1

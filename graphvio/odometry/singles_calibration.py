@@ -74,7 +74,7 @@ class SinglesCalibration:
         self._on_full_window = on_window
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Take an IMU sample for the windows."""
+        """Add an IMU sample for the windows."""
         if self._on_full_window is not None:
             self._collector.add_sample(sample)
 
@@ -89,7 +89,7 @@ class SinglesCalibration:
         return visual
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Take note of how the stamps jitter, and take a frameset for the windows."""
+        """Record how the stamps jitter, and add a frameset for the windows."""
         self._estimator.note_stamps(self._synchroniser.stamp_sigma_s)
         if self._on_full_window is None:
             return

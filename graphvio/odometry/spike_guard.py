@@ -40,7 +40,7 @@ class SpikeGuard:
         self._count, self._left_out = 0, 0.0  # samples, and the recent share of those that were left out
 
     def confirm(self, sample: ImuSample) -> list[ImuSample]:
-        """Take a sample, and return those that may be used now, in time order, with those that no sensor reads."""
+        """Add a sample, and return those that may be used now, in time order, with those that no sensor reads."""
         readings = _readings(sample)
         if self._newest is None:
             if not value_fault(sample):

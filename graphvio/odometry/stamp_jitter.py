@@ -26,7 +26,7 @@ class StampJitter:
         self._sigma_s: float | None = 0.0
 
     def add(self, stamp_ns: int, group: int) -> None:
-        """Take the stamp of the next frameset, some of which may be missing.
+        """Add the stamp of the next frameset, some of which may be missing.
 
         Args:
             stamp_ns: of the frameset.

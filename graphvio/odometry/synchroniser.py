@@ -166,7 +166,7 @@ class Synchroniser:
         return frameset.stamp_ns - self._lateness_ns.get(group, 0)
 
     def set_lateness(self, group: int, seconds: float) -> None:
-        """Take the stamps of a group's own framesets to be so late, of those that are taken from now on."""
+        """Set by how much the stamps of a group's own framesets are late, for those that are processed from now on."""
         self._lateness_ns[group] = round(seconds * 1e9)
 
     def instant_ns(self, stamp_ns: int) -> int:
