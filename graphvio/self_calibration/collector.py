@@ -59,7 +59,7 @@ class WindowCollector:
         self._last: Keyframe | None = None
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Take an IMU sample as it was measured, in time order."""
+        """Add an IMU sample as it was measured, in time order."""
         self._samples.append(sample)
         while sample.stamp_ns - self._samples[0].stamp_ns > _KEPT_NS:
             self._samples.popleft()

@@ -41,7 +41,8 @@ class ConsiderCovariance:
         Args:
             keyframes: K of them. Those up to the newest one that is known already count no second time; one that
                 follows the window before is as far from it as the keyframes of this one from each other.
-            by_cameras: (K, 6, N) derivatives of the window's poses, of which the first stays, by the calibration.
+            by_cameras: (K, 6, N) derivatives of the window's poses, of which the first stays, with respect to the
+                calibration.
         """
         newest = keyframes[-1]
         known = keyframes[0] if self._newest is None else self._newest
@@ -56,7 +57,7 @@ class ConsiderCovariance:
         self._newest = newest
 
     def learn(self, difference: Float, covariance: Float) -> None:
-        """Take the calibration that is in force from now on.
+        """Set the calibration that is in force from now on.
 
         Args:
             difference: (N,) from the rig file.
@@ -66,7 +67,7 @@ class ConsiderCovariance:
         self._difference, self._covariance = difference, covariance
 
     def correct(self, change: Float) -> None:
-        """Take note that the newest pose has been changed by a tangent (6,) in its own frame."""
+        """Record that the newest pose has been changed by a tangent (6,) in its own frame."""
         self._left_behind = self._left_behind - change
 
     def forget(self) -> None:

@@ -127,7 +127,7 @@ def inertial_residual(
 
     Returns:
         Error (9,) ``[rotation, velocity, position]``, whose covariance is the preintegrated one, and its derivative
-        (9, 46) by ``[pose i 6, velocity i 3, pose j 6, velocity j 3, gravity 3, parameters 25]``.
+        (9, 46) with respect to ``[pose i 6, velocity i 3, pose j 6, velocity j 3, gravity 3, parameters 25]``.
     """
     dt = preintegrated.duration_s
     i_R_nav = nav_T_i[:3, :3].T.copy()

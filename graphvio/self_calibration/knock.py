@@ -26,7 +26,7 @@ class KnockDetector:
         self._off: dict[int, int] = {}  # pair index -> keyframes, one after the other
 
     def update(self, views: Mapping[int, View], calibration: RigCalibration) -> list[int]:
-        """Take a keyframe's views.
+        """Add a keyframe's views.
 
         Returns:
             Indices of the pairs whose cameras have been off for so long that they are no longer where they were.

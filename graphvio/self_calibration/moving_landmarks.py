@@ -25,7 +25,7 @@ def move_landmark(
         frame: (4, 4) of the landmark in odom; output too.
         landmark: (3,) before.
         inverse: (3, 3) of its normal matrix.
-        gradient: (3,) of the cost by it after the step of the others.
+        gradient: (3,) of the cost with respect to it, after the step of the others.
         pose: (4, 4) ``odom_T_body`` before, of the state that sees it first.
         moved_pose: (4, 4) after.
         body_T_cam: (4, 4) of the camera that sees it first.

@@ -1,7 +1,7 @@
-"""One observation of a landmark by a pair or single camera: its errors, and their derivatives by all unknowns.
+"""One observation of a landmark by a pair or single camera: its errors, and derivatives with respect to all unknowns.
 
-The row of an image's error in one direction has the derivatives by the keyframe's pose, by the pair's calibration and
-by the landmark, and then the error itself, in columns that begin at 0, `POSE`, `POINT_AT` and `ERROR_AT`.
+The row of an image's error in one direction has the derivatives with respect to the keyframe's pose, the pair's
+calibration and the landmark, and then the error itself, in columns that begin at 0, `POSE`, `POINT_AT` and `ERROR_AT`.
 """
 
 from typing import NamedTuple
@@ -52,7 +52,7 @@ def _project(
     calibration: RigCalibration, j: int, image: int, y: Float, seen: Float, to_pixel: Float, error: Float,
     by_camera: Float,
 ) -> bool:  # fmt: skip
-    """Project a homogeneous point (3,): the error (2,), its derivatives by the point (2, 3) and the camera (2, 9)."""
+    """Project a homogeneous point (3,): error (2,), derivatives with respect to point (2, 3) and camera (2, 9)."""
     if not y[2] > MIN_DEPTH_RATIO:
         return False
     model, intrinsics, distortion = (
@@ -91,7 +91,7 @@ def observe(
     pose: Float, calibration: RigCalibration, j: int, odom_T_landmark: Float, landmark: Float,
     left_px: Float, right_px: Float, has_right: bool, scratch: Scratch, rows: Float,
 ) -> int:  # fmt: skip
-    """Fill the rows (4, COLUMNS) of one observation: derivatives by pose, calibration and landmark, and errors.
+    """Fill rows (4, COLUMNS) of one observation: derivatives with respect to pose, calibration and landmark, errors.
 
     Loops stand for slices throughout: each slice that is assigned takes seconds to compile, in every kernel that calls.
 

@@ -79,7 +79,7 @@ def has_coefficient(camera: Camera) -> Bool:
 
 
 def about_origin(rig: Rig, j: int) -> Float:
-    """Return the derivatives (6, 6) of d by the parameters of extrinsics, where these are ``exp(d) body_T_left``."""
+    """Return derivatives (6, 6) of d with respect to parameters of extrinsics, which are ``exp(d) body_T_left``."""
     rows = np.eye(6)
     rows[3:, :3] = skew(rig.groups[j].left.body_T_cam[:3, 3])
     return rows

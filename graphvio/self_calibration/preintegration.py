@@ -2,7 +2,7 @@
 
 Values are integrated to fourth order in the step (Simpson's rule; rotations with the term of coning): C. Forster,
 L. Carlone, F. Dellaert, D. Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial Odometry*, IEEE T-RO
-33(1), 2017, with derivatives by all parameters of `graphvio.self_calibration.imu_model`.
+33(1), 2017, with derivatives with respect to all parameters of `graphvio.self_calibration.imu_model`.
 """
 
 from typing import NamedTuple
@@ -42,7 +42,7 @@ class Preintegrated(NamedTuple):
         rotation: (3, 3) ``start_R_end``.
         velocity: (3,) m/s.
         position: (3,) m.
-        jacobian: (9, 25) derivative by the parameters.
+        jacobian: (9, 25) derivative with respect to the parameters.
         covariance: (9, 9) of the samples' white noise.
         duration_s: of the interval.
     """

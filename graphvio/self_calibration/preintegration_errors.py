@@ -27,15 +27,16 @@ def add_cross(factor: float, a: Float, b: Float, out: Float) -> None:
 
 @kernel
 def add_derivatives(h: float, rotation: Float, force: Float, raw: Float, sums: Float) -> None:
-    """Add a step to the derivatives by errors of rate and force, frame of the interval's start.
+    """Add a step to the derivatives with respect to errors of rate and force, frame of the interval's start.
 
     Args:
         h: duration of the step, s.
         rotation: (3, 3) in its middle.
         force: (3,) rotated by it.
         raw: (6,) readings less bias.
-        sums: (5, 4, 3, 3) derivatives of the rotation on the left, velocity and position by rate, and of velocity and
-            position by force: by an error that is constant, and by ones that are proportional to each axis' reading.
+        sums: (5, 4, 3, 3) derivatives of the rotation on the left, velocity and position with respect to rate, and of
+            velocity and position with respect to force: to an error that is constant, and to ones that are proportional
+            to each axis' reading.
     """
     by_rate, rate_velocity, rate_position, force_velocity, force_position = sums
     fx, fy, fz = force
