@@ -175,7 +175,7 @@ class WindowCalibration:
         return evidence_of(at, adjusted.states, file)
 
     def update(self, evidence: Evidence) -> bool:
-        """Take what the window and what left it say of the calibration.
+        """Use what the window and what left it say of the calibration.
 
         Returns:
             Whether the factors have changed.

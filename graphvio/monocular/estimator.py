@@ -165,11 +165,11 @@ class MonocularEstimator:
     # ------------------------------------------------------------------ one frameset
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
-        """Take an IMU sample (6,), stamped on the framesets' clock."""
+        """Add an IMU sample (6,), stamped on the framesets' clock."""
         self._samples.add(stamp_ns + self._shift_ns, values)
 
     def shift_samples(self, shift_ns: int) -> None:
-        """Take note that stamps of samples have a correction of the time offset from now on, which is a state here."""
+        """Record that stamps of samples have a correction of the time offset from now on, which is a state here."""
         self._shift_ns += shift_ns
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
@@ -212,7 +212,7 @@ class MonocularEstimator:
         return False
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
-        """Take what the cameras see; it is tested when the window is solved."""
+        """Record what the cameras see; it is tested when the window is solved."""
         self._has_overlaps |= shared_points(visual.camera_tracks) > 0
         seen = dict(visual.camera_tracks) if self._are_trusted else alone(visual.camera_tracks)
         self._camera_tracks, self._is_stationary = seen, is_stationary
@@ -347,11 +347,11 @@ class MonocularEstimator:
         self._collect_keyframes()
 
     def note_stamps(self, sigma_s: float) -> None:
-        """Take the standard deviation of the framesets' stamps, seconds, as it is known now."""
+        """Set the standard deviation of the framesets' stamps, seconds, as it is known now."""
         self._calibration.are_stamps_exact = sigma_s < _MAX_STAMP_SIGMA_S
 
     def doubt_imu(self, stamp_ns: int, is_doubted: bool) -> None:
-        """Take note of whether the IMU turns as the cameras do; where it does not, there is no pose."""
+        """Record whether the IMU turns as the cameras do; where it does not, there is no pose."""
         self._is_imu_doubted = is_doubted
         if is_doubted and self._window is not None:
             self._lose(stamp_ns, _TURNS_OTHERWISE)

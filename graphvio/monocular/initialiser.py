@@ -88,7 +88,7 @@ class Initialiser:
         self.scale_sigma = np.inf  # of the window that was tested last, as a share
 
     def know_gyro_bias(self, gyro_bias: Float, sigma: float) -> None:
-        """Take the gyro's bias (3,) rad/s as a standstill shows it."""
+        """Set the gyro's bias (3,) rad/s as a standstill shows it."""
         self._gyro_bias, self._gyro_bias_sigma = gyro_bias, sigma
 
     @property
@@ -99,7 +99,7 @@ class Initialiser:
     def add(
         self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool
     ) -> KeyframeWindow | None:
-        """Take a keyframe, and return the window if its scale is known."""
+        """Add a keyframe, and return the window if its scale is known."""
         if is_stationary and self._keyframes and self._keyframes[-1].is_stationary:
             self._keyframes.pop()  # of a standstill the newest keyframe stays
         self._keyframes.append(_Keyframe(stamp_ns, camera_tracks, is_stationary))

@@ -46,14 +46,14 @@ class OverlapTrust:
         return None if self._initialiser is None else self._initialiser.oldest_ns
 
     def know_gyro_bias(self, gyro_bias: np.ndarray, sigma: float) -> None:
-        """Take the gyro's bias (3,) rad/s as a standstill shows it."""
+        """Set the gyro's bias (3,) rad/s as a standstill shows it."""
         if self._initialiser is not None:
             self._initialiser.know_gyro_bias(gyro_bias, sigma)
 
     def add(
         self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool, states: States | None
     ) -> tuple[KeyframeWindow, str] | None:
-        """Take a keyframe.
+        """Add a keyframe.
 
         Args:
             stamp_ns: of the keyframe.

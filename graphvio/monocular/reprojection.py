@@ -1,4 +1,7 @@
-"""Reprojection error of one view of a landmark by a single camera, and its derivatives by pose, camera and landmark."""
+"""Reprojection error of one view of a landmark by a single camera, and its derivatives.
+
+These are with respect to pose, camera and landmark.
+"""
 
 from typing import NamedTuple
 
@@ -75,7 +78,7 @@ def have_moved(cameras: Cameras) -> bool:
 
 @kernel
 def _by_lens(cameras: Cameras, j: int, x: float, y: float, out: Float) -> None:
-    """Fill the derivatives (2, 9) of a ray by the lens, for a pixel that stays where it was seen.
+    """Fill the derivatives (2, 9) of a ray with respect to the lens, for a pixel that stays where it was seen.
 
     They are wanted where a ray is expected. At the ray that was seen, they would go along with its noise: over tens of
     thousands of views, that is a focal length which is wrong by six standard deviations.
@@ -102,7 +105,7 @@ def whiten_view(
     pose: Float, cameras: Cameras, j: int, frame: Float, landmark: Float, ray: Float, sigma_px: float,
     of_state: bool, by_lens: Float, rows: Float,
 ) -> bool:  # fmt: skip
-    """Fill the rows (2, COLUMNS) of one view: derivatives by pose, camera and landmark, and the error, whitened.
+    """Fill the rows (2, COLUMNS) of one view: derivatives with respect to pose, camera and landmark, whitened error.
 
     Coordinates are variables throughout: arrays would be allocated for each view.
 
@@ -114,9 +117,9 @@ def whiten_view(
         landmark: (3,).
         ray: (2,) that was seen, by the lens of the rig file.
         sigma_px: noise of a corner's position.
-        of_state: whether derivatives by pose and camera are wanted, too.
-        by_lens: (2, 9) for intermediate results; (0, 9) where the lens is that of the rig file, and no derivatives by
-            the camera are wanted.
+        of_state: whether derivatives with respect to pose and camera are wanted, too.
+        by_lens: (2, 9) for intermediate results; (0, 9) where the lens is that of the rig file, and no derivatives
+            with respect to the camera are wanted.
         rows: output.
 
     Returns:

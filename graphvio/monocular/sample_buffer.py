@@ -42,7 +42,7 @@ class SampleBuffer:
         self._stamps_ns, self._readings = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
 
     def add(self, stamp_ns: int, values: Float) -> None:
-        """Take a sample (6,), gyro in rad/s and accelerometer in m/s^2, stamped on the framesets' clock."""
+        """Add a sample (6,), gyro in rad/s and accelerometer in m/s^2, stamped on the framesets' clock."""
         self._waiting_ns.append(stamp_ns)
         self._waiting.append(values)
 

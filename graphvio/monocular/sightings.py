@@ -112,7 +112,7 @@ class LandmarkNames:
         return views.once(np.concatenate(ranks))
 
     def note_keyframe(self) -> None:
-        """Take note that the newest tracks are those of a keyframe."""
+        """Record that the newest tracks are those of a keyframe."""
         self._left = self._left - 1
 
     def end(self, landmarks: Int) -> None:
@@ -204,7 +204,7 @@ class Landmarks:
         return structure, places, ids
 
     def put(self, frames: Float, places: Float) -> None:
-        """Take new frames (L, 4, 4) of the landmarks that were last collected, and their places (L, 3) there."""
+        """Set new frames (L, 4, 4) of the landmarks that were last collected, and their places (L, 3) there."""
         self._frames, self._places = frames, places
 
     def turn(self, new_T_odom: Float) -> None:

@@ -99,7 +99,7 @@ class WindowSolver:
     # ------------------------------------------------------------------ one window
 
     def begin(self, window: KeyframeWindow, stamp_ns: int) -> None:
-        """Take the window of an epoch's first pose, at a frameset."""
+        """Begin with the window of an epoch's first pose, at a frameset."""
         self.first_pose_ns = stamp_ns
         self.calibration.begin(window.factors)
 
