@@ -162,7 +162,7 @@ def _sphere(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
 
 @kernel
 def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float:
-    """Compute the derivatives (5, 2) of the distorted normalised coordinates of (x, y) by the first coefficients.
+    """Compute derivatives (5, 2) of the distorted coordinates of (x, y) with respect to the first coefficients.
 
     Zero for those that a model does not have, and outside its domain.
     """
@@ -202,7 +202,7 @@ def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float
 
 @kernel
 def _sphere_derivatives(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float, float]:
-    """Compute `_sphere`'s scale and its derivatives by xi, alpha and beta; 0 outside the model's domain."""
+    """Compute `_sphere`'s scale and derivatives with respect to xi, alpha and beta; 0 outside the model's domain."""
     scale, _ = _sphere(model, distortion, x, y)
     if not scale > 0.0:
         return 0.0, 0.0, 0.0, 0.0

@@ -69,7 +69,7 @@ def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, disper
 
 
 def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
-    """Return derivatives (2 N, 6, 6) of the paper's solution by errors of all first, then all second motions."""
+    """Return derivatives (2 N, 6, 6) of the paper's solution with respect to errors of first, then second motions."""
     R = paper.left2_T_left1[:3, :3]
     t = -R.T @ paper.left2_T_left1[:3, 3]
     J = jacobians(PoseParts.of(pairs), R) * paper.inlier[:, None, None]

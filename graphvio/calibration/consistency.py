@@ -138,8 +138,8 @@ def whitened(
         values: (M,) of the nuisance variables.
 
     Returns:
-        Errors (N, 6) of unit covariance, and derivatives (N, 6, 6 + M) by the tangent of ``left2_T_left1`` in left1
-        and by the nuisance variables.
+        Errors (N, 6) of unit covariance, and derivatives (N, 6, 6 + M) with respect to the tangent of ``left2_T_left1``
+        in left1 and to the nuisance variables.
     """
     if nuisances is None or values is None:
         nuisances, values = Nuisances.none(len(pairs)), np.empty(0)
@@ -149,7 +149,10 @@ def whitened(
 
 @kernel
 def error_of(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> tuple[Float, Float]:
-    """Compute the error (6,) of a pose pair in left2 at the end, and its derivative (6, 6) by the tangent in left1."""
+    """Compute the error (6,) of a pose pair in left2 at the end, and its derivative (6, 6).
+
+    The derivative is with respect to the tangent of ``left2_T_left1`` in left1.
+    """
     error = _error(left2_T_left1, motion_1, motion_2)
     by_tangent = se3_adjoint(left2_T_left1) @ (se3_adjoint(se3_inverse(motion_1)) - np.eye(6))
     return error, se3_right_jacobian_inverse(error) @ by_tangent

@@ -100,7 +100,7 @@ def holding(key: int, held: Float, there: Float) -> gtsam.NonlinearFactor:
 
 
 def _factor(pairs: PosePairs, k: int, left2_T_left1: Float, by_nuisances: Float | None) -> gtsam.NonlinearFactor:
-    """Factor of pose pair k, weighted as at ``left2_T_left1``; derivatives (6, M) are by nuisance variables."""
+    """Factor of pose pair k, weighted at ``left2_T_left1``; derivatives (6, M) with respect to nuisance variables."""
     motion_1, motion_2 = pairs.motion_1[k], pairs.motion_2[k]
 
     def error(_: Any, values: gtsam.Values, jacobians: list[Float] | None) -> Float:

@@ -192,7 +192,10 @@ class _Rotations:
         return _Solution(rotation, bias, offset_s, covariance, cost)
 
     def _linearised(self, rotation: Float, bias: Float, offset_s: float) -> tuple[Float, Float]:
-        """Compute errors (N, 3) in body at the end, and derivatives (N, 3, 7) by left rotation, bias and offset."""
+        """Compute errors (N, 3) in body at the end, and derivatives (N, 3, 7).
+
+        These are with respect to left rotation, bias and offset.
+        """
         by_vision = rotation @ self.turns @ rotation.T
         by_gyro = self.by_gyro(offset_s, bias)
         later = self.by_gyro(offset_s + _STEP_S, bias)

@@ -147,7 +147,7 @@ def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
 
 
 def jacobians(parts: PoseParts, R: Float) -> Float:
-    """Differentiate the alignment errors: (N, 3, 6) by ``[dt, dq]``; dq is half a rotation vector, from the left."""
+    """Differentiate the alignment errors (N, 3, 6) with respect to ``[dt, dq]``; dq is half a left rotation vector."""
     made = np.empty((len(parts.R_1), 3, 6))
     made[:, :, :3] = np.swapaxes(parts.R_1, 1, 2) - np.eye(3)
     made[:, :, 3:] = _by_turn(R, _moved_crosses(parts))
@@ -155,7 +155,7 @@ def jacobians(parts: PoseParts, R: Float) -> Float:
 
 
 def _by_turn(R: Float, crosses: Float) -> Float:
-    """Differentiate the alignment errors by dq: (N, 3, 3)."""
+    """Differentiate the alignment errors with respect to dq: (N, 3, 3)."""
     return np.asarray(2.0 * np.einsum("ji,njk->nik", R, crosses))  # 2 R^T [R_2^T T_2]_x
 
 
@@ -244,7 +244,7 @@ def _costs(
     for m in range(len(R)):
         for n in range(len(R_1)):
             for i in range(3):
-                # eq. (7), and its derivative by the first motion: [-R_1^T skew(t), R_1^T]
+                # eq. (7), and its derivative with respect to the first motion: [-R_1^T skew(t), R_1^T]
                 error[i] = -t[m, i]
                 for j in range(3):
                     moved = R_2[n, 0, j] * T_2[n, 0] + R_2[n, 1, j] * T_2[n, 1] + R_2[n, 2, j] * T_2[n, 2]

@@ -178,7 +178,7 @@ class _Fleet:
             raise
 
     def _after(self, client: Any, session: _Session, stage: str, future: Any) -> list[Any]:
-        """Take the result of a task, and submit the tasks that can follow."""
+        """Use the result of a task, and submit the tasks that can follow."""
         try:
             marker = future.result()
         except Exception as error:

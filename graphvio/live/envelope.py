@@ -55,7 +55,7 @@ class Envelope:
         self._below: list[_Point] = []
 
     def add(self, time_ns: int, delay_ns: int) -> bool:
-        """Take a point.
+        """Add a point.
 
         Args:
             time_ns: of the clock.
@@ -83,7 +83,7 @@ class Envelope:
         return False
 
     def _add_below(self, point: _Point) -> bool:
-        """Take a point that no delay explains; one alone may be a damaged stamp, and is not used."""
+        """Add a point that no delay explains; one alone may be a damaged stamp, and is not used."""
         self._below.append(point)
         if len(self._below) < _STEP_READINGS:
             return False

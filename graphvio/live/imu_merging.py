@@ -38,7 +38,7 @@ class AccelOntoGyro:
         self._accels: deque[tuple[int, Float]] = deque(maxlen=_ACCELS_KEPT)
 
     def add_gyro(self, reading: ImuReading) -> None:
-        """Take a rate, whose ``linear_acceleration`` is not read; a stamp that was there already is ignored."""
+        """Add a rate, whose ``linear_acceleration`` is not read; a stamp that was there already is ignored."""
         with self._lock:
             if self._newest_gyro_ns is not None and reading.stamp_ns <= self._newest_gyro_ns:
                 self._counts.add("imu_out_of_order", reading.stamp_ns < self._newest_gyro_ns)
@@ -51,7 +51,7 @@ class AccelOntoGyro:
             self._hand_over_ready()
 
     def add_accel(self, stamp_ns: int, acceleration: Float) -> None:
-        """Take an acceleration (3,), frame body; a stamp that was there already is ignored."""
+        """Add an acceleration (3,), frame body; a stamp that was there already is ignored."""
         with self._lock:
             if self._accels and stamp_ns <= self._accels[-1][0]:
                 self._counts.add("imu_out_of_order", stamp_ns < self._accels[-1][0])

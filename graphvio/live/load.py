@@ -55,7 +55,7 @@ class LoadControl:
         return True
 
     def add(self, stamp_ns: int, waited_ms: float, work_ms: float) -> None:
-        """Take the times of a frameset that was processed, and adapt the share of corners.
+        """Add the times of a frameset that was processed, and adapt the share of corners.
 
         Args:
             stamp_ns: of the frameset.

@@ -21,13 +21,13 @@ class Output:
     """Base of consumers; this one ignores all. None may block the threads that hand measurements over."""
 
     def add_measurement(self, measurement: Measurement) -> None:
-        """Take a sample or frameset as it comes; called from several threads."""
+        """Add a sample or frameset as it comes; called from several threads."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
-        """Take an estimate, and its images if they are still kept."""
+        """Add an estimate, and its images if they are still kept."""
 
     def add_event(self, event: Event) -> None:
-        """Take an event; called from several threads."""
+        """Add an event; called from several threads."""
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """Return the output's figures by name; called from any thread."""

@@ -56,7 +56,7 @@ class FramesetAssembler:
         self._given_ns: int | None = None
 
     def add(self, camera: str, stamp_ns: int, image: Image, arrival_ns: int) -> list[FrameSet]:
-        """Take an image.
+        """Add an image.
 
         Args:
             camera: its name in the rig.
@@ -79,7 +79,7 @@ class FramesetAssembler:
         return list(self._due())
 
     def advance(self, arrival_ns: int) -> list[FrameSet]:
-        """Take the host time without an image; returns the framesets that have waited long enough."""
+        """Advance the host time without an image; returns the framesets that have waited long enough."""
         self._set_time(arrival_ns)
         return list(self._due())
 

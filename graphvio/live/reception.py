@@ -162,7 +162,7 @@ class SampleOrder:
         self._steps_ns: deque[int] = deque(maxlen=_PERIODS)
 
     def add(self, sample: ImuSample) -> list[ImuSample]:
-        """Take a sample, and return those that go on, in order.
+        """Add a sample, and return those that go on, in order.
 
         One that is older than those that went on goes on, too: the odometry reports it.
         """

@@ -96,7 +96,7 @@ def _cliques(keys: list[list[int]]) -> list[_Clique]:
 
 
 def _of_separator(clique: _Clique) -> Float:
-    """Take the covariance of a clique's separator from its parent."""
+    """Return the covariance of a clique's separator from its parent, whose own is freed after the last child."""
     parent = clique.parent
     if parent is None:
         return np.zeros((0, 0))

@@ -96,10 +96,11 @@ class RelativePoses:
         Args:
             residual: changed in place.
             poses: ``nav_T_body`` as they are now.
-            derivatives: by each pose, of which all but the first are filled in; None where they are not needed.
+            derivatives: with respect to each pose, of which all but the first are filled in; None where not
+                needed.
 
         Returns:
-            Derivative (M, 6) by the first pose; zero without derivatives.
+            Derivative (M, 6) with respect to the first pose; zero without derivatives.
         """
         inverse, by_first = se3_inverse(poses[0]), np.zeros((len(residual), 6))
         for k, (pose, then_T_first) in enumerate(zip(poses[1:], self._known, strict=True)):

@@ -29,7 +29,7 @@ class CalibrationHistory:
         self._values: list[tuple[Float, Float]] = []
 
     def add(self, stamp_ns: int, estimate: CalibrationEstimate) -> None:
-        """Take an estimate that is in force from a stamp on; stamps increase."""
+        """Add an estimate that is in force from a stamp on; stamps increase."""
         if not self._curves:
             self._curves = curves_of(estimate.file_rig)
         self._stamps_ns.append(stamp_ns)

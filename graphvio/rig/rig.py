@@ -127,10 +127,7 @@ class Rig:
         return replace(self, pairs=tuple(pairs), singles=tuple(singles))
 
     def without_pairs(self) -> Rig:
-        """Take each camera for a single one.
-
-        Returns:
-            The rig without pairs.
+        """Return the rig with each camera as a single one, without pairs.
 
         Raises:
             RigError: if there is no IMU.

@@ -86,7 +86,7 @@ class Motion:
 
 
 def _weights_and_derivatives(u: Float) -> tuple[Float, Float, Float]:
-    """Compute weights (N, 6) of the control values, and their first and second derivatives by time."""
+    """Compute weights (N, 6) of the control values, and their first and second derivatives with respect to time."""
     powers = u ** np.arange(6)
     n = np.arange(6)
     first = np.zeros_like(powers)

@@ -258,7 +258,7 @@ def shade(
         items: (N,) from `tile_lists`.
         bounds: (N,) from `tile_lists`.
         rays: (H, W, 2) normalised coordinates of the pixels.
-        slopes: (H, W, 2, 2) their derivative by the pixel's column and row.
+        slopes: (H, W, 2, 2) their derivative with respect to the pixel's column and row.
         hit: (H, W) from `first_hits`.
         texture: (Q,), see `Surfaces`.
         mapping: (Q, 4), see `Surfaces`.

@@ -82,7 +82,7 @@ class CameraRays:
 
 @kernel
 def _ray_slopes(model: int, intrinsics: Float, distortion: Float, rays: Float) -> Float:
-    """Differentiate rays (N, 2) by the pixel's column and row: (N, 2, 2)."""
+    """Differentiate rays (N, 2) with respect to the pixel's column and row: (N, 2, 2)."""
     slopes = np.empty((len(rays), 2, 2))
     for i in range(len(rays)):
         _, _, a, b, c, d = distort(model, distortion, rays[i, 0], rays[i, 1])

@@ -57,14 +57,14 @@ class FeaturesAhead:
         self._thread.join()
 
     def add(self, step: Step) -> None:
-        """Take a step of the odometry."""
+        """Add a step of the odometry."""
         estimate = step.estimate
         self._references |= step.references
         if estimate.nav_T_body is not None and estimate.status is not Status.LOST:
             self._epochs[estimate.stamp_ns] = estimate.epoch
 
     def add_smoothed(self, poses: Iterable[tuple[int, Float]]) -> None:
-        """Take stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window."""
+        """Add stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window."""
         self._final.update(poses)
         while self._epochs and (stamp_ns := next(iter(self._epochs))) in self._final:
             epoch, pose = self._epochs.pop(stamp_ns), self._final.pop(stamp_ns)
