@@ -202,36 +202,11 @@ class SelfCalibration:
             self._due_in -= 1
             return False
         pending, self._pending = self._pending, None
-        try:
-            adjusted = pending.result()
-        except np.linalg.LinAlgError:
-            return False  # measurements that determine nothing
-        except RigError:
-            return False  # an IMU that is no IMU of any rig: its measurements are wrong
-        prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
-        if not solution.has_converged:
+        adjusted = _finished_adjustment(pending)
+        if adjusted is None or not self._is_acceptable(adjusted):
             return False
-        if self.has_full_window and not prior.is_confirmed_by(solution.calibration):
-            self._refuse(is_full)
-            return False
-        if not (np.abs(solution.calibration.mean) <= self._largest).all():  # also rejects NaN
-            return False  # no rig file is so wrong: the measurements are
         was_exact = self.estimate.is_file_exact
-        if self.has_full_window and was_exact and not (is_full or adjusted.estimate.is_file_exact):
-            return False  # what a full window has confirmed, a part of one does not refute: it may be the scene's fault
-        if is_full:
-            self._evidence, self._refused = evidence, 0
-            self._used_windows += 1
-        if (
-            len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
-            and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
-        ):
-            noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
-            self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
-        self._consider.extend(adjusted.window, adjusted.by_cameras)
-        self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
-        self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
-        self._in_force = self._nominal.moved(self.estimate.difference[: self._n_cameras])
+        self._put_in_force(adjusted)
         return not (was_exact and self.estimate.is_file_exact)
 
     @property
@@ -259,6 +234,35 @@ class SelfCalibration:
     @property
     def _pace(self) -> _Pace:
         return _PACES[min(self._full_windows, len(_PACES) - 1)]
+
+    def _is_acceptable(self, adjusted: _Adjusted) -> bool:
+        """Return whether an adjustment may come into force; one that contradicts those before it counts as refused."""
+        calibration = adjusted.solution.calibration
+        if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
+            self._refuse(adjusted.is_full)
+            return False
+        if not (np.abs(calibration.mean) <= self._largest).all():  # also rejects NaN
+            return False  # no rig file is so wrong: the measurements are
+        # What a full window has confirmed, a part of one does not refute: it may be the scene's fault.
+        is_confirmed = self.has_full_window and self.estimate.is_file_exact
+        return adjusted.is_full or adjusted.estimate.is_file_exact or not is_confirmed
+
+    def _put_in_force(self, adjusted: _Adjusted) -> None:
+        """Use an adjustment's result from now on, and its noise for the next windows."""
+        if adjusted.is_full:
+            self._evidence, self._refused = adjusted.evidence, 0
+            self._used_windows += 1
+        solution, n_cameras = adjusted.solution, self._n_cameras
+        if (
+            len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
+            and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
+        ):
+            noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
+            self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
+        self._consider.extend(adjusted.window, adjusted.by_cameras)
+        self._consider.learn(adjusted.estimate.difference[:n_cameras], adjusted.covariance)
+        self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
+        self._in_force = self._nominal.moved(self.estimate.difference[:n_cameras])
 
     def _refuse(self, is_full: bool) -> None:
         """Discard a window that contradicts those before it; several such windows are a knock."""
@@ -375,6 +379,17 @@ def warm_up_adjustment(rig: Rig) -> None:
     information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
     solve_lower(cholesky(information), right)
     solve_rows(information, right)
+
+
+def _finished_adjustment(pending: Future[_Adjusted]) -> _Adjusted | None:
+    """Return an adjustment when it is done, or None where it says nothing."""
+    try:
+        adjusted = pending.result()
+    except np.linalg.LinAlgError:
+        return None  # measurements that determine nothing
+    except RigError:
+        return None  # an IMU that is no IMU of any rig: its measurements are wrong
+    return adjusted if adjusted.solution.has_converged else None
 
 
 def _assumed(factors: Float) -> Float:
