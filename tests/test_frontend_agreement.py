@@ -17,8 +17,9 @@ from graphvio.frontend.pair_reports import pair_reports
 from graphvio.frontend.quality import StereoShare, graded, graded_hypothesis, stereo_share
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion_known_depths
+from graphvio.frontend.tracking_frontend import Seen
 from graphvio.frontend.tracks import TrackedFrame
-from graphvio.frontend.visual import Seen, VisualFrontend
+from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion
 

@@ -13,8 +13,8 @@ from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
+from graphvio.frontend.tracking_frontend import MotionPredictor, Seen, TrackingFrontend
 from graphvio.frontend.tracks import TrackedFrame, common_rows
-from graphvio.frontend.visual import MotionPredictor, Seen, VisualFrontend
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
@@ -26,7 +26,7 @@ _KEYFRAMES_AHEAD = 2.0  # what leaves a view until then is handed over
 _MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to predict tracks by
 
 
-class SinglesFrontend(VisualFrontend):
+class SinglesFrontend(TrackingFrontend):
     """Tracks every camera, and decides when a keyframe begins."""
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:

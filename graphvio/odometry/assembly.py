@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
-from graphvio.frontend.visual import VisualFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.motion import VisualResult
@@ -114,7 +114,7 @@ def at_stamp(estimate: Estimate, body_T_stamped: Float) -> Estimate:
 
 
 def keyframe_of(
-    frameset: FrameSet, frontend: VisualFrontend, estimator: StateEstimator, nav: NavFrame, previous_ns: int | None
+    frameset: FrameSet, frontend: TrackingFrontend, estimator: StateEstimator, nav: NavFrame, previous_ns: int | None
 ) -> NewKeyframe:
     """Return the data of a frameset from which later motions are measured.
 

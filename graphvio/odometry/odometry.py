@@ -20,6 +20,7 @@ from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
 from graphvio.frontend.images import ImageMask
 from graphvio.frontend.singles import SinglesFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import CORRECTED, Event
@@ -80,6 +81,10 @@ def _config_of(rig: Rig, config: Config) -> Config:
     return config
 
 
+def _frontend_class(rig: Rig) -> type[VisualFrontend | SinglesFrontend]:
+    return VisualFrontend if rig.pairs else SinglesFrontend
+
+
 def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | FilterEstimator | MonocularEstimator]:
     if not rig.pairs:
         return MonocularEstimator
@@ -116,7 +121,7 @@ class Odometry:
         self.rig = rig
         self.config = _config_of(rig, config or Config())
         self.stage_ms: dict[str, float] = {}
-        self._frontend = (VisualFrontend if rig.pairs else SinglesFrontend)(rig, self.config, image_mask)
+        self._frontend: TrackingFrontend = _frontend_class(rig)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
         self._estimator: StateEstimator = _estimator_class(rig, self.config)(rig, self.config, self.report)
         self._imu = FramesetImu(rig, self.config, self._synchroniser, self._estimator, self.report)
@@ -135,12 +140,13 @@ class Odometry:
         self._finished = False
 
     def _new_calibration(self) -> OnlineCalibration:
-        rig, estimator = self.rig, self._estimator
+        rig, frontend, estimator = self.rig, self._frontend, self._estimator
         if not self.config.estimates_calibration:
             return FixedCalibration()
         if isinstance(estimator, MonocularEstimator):
-            return SinglesCalibration(rig, self._frontend, self._synchroniser, estimator, self.report)
-        return PairsCalibration(rig, self.config, self._frontend, self._synchroniser, estimator, self.report)
+            return SinglesCalibration(rig, frontend, self._synchroniser, estimator, self.report)
+        assert isinstance(frontend, VisualFrontend)
+        return PairsCalibration(rig, self.config, frontend, self._synchroniser, estimator, self.report)
 
     # ------------------------------------------------------------------ measurements in, estimates out
 

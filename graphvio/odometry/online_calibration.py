@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from graphvio.arrays import Float
-from graphvio.frontend.visual import VisualFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
@@ -100,7 +100,7 @@ class OnlineCalibration(Protocol):
         """End what runs beside the odometry: no frameset follows."""
 
 
-def views_at(frontend: VisualFrontend, stamp_ns: int) -> dict[int, View]:
+def views_at(frontend: TrackingFrontend, stamp_ns: int) -> dict[int, View]:
     """Return what pairs and single cameras, by their index, see at the newest frameset, if it has this stamp."""
     return {
         j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])

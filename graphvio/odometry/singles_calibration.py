@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.visual import VisualFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
@@ -41,7 +41,7 @@ class SinglesCalibration:
     def __init__(
         self,
         rig: Rig,
-        frontend: VisualFrontend,
+        frontend: TrackingFrontend,
         synchroniser: Synchroniser,
         estimator: MonocularEstimator,
         report: Report,
