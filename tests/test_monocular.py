@@ -376,7 +376,7 @@ def at_best(measured: Measurements, states: States, landmarks: Float) -> tuple[F
     cameras = states.cameras(measured.cameras)
     for _ in range(20):
         landmarks = located(states.poses, cameras, landmarks, measured.structure, 2.0, True)
-    eliminated = Eliminated.empty(measured.structure, states.n_cameras)
+    eliminated = Eliminated.empty(measured.structure, states.n_camera_parameters)
     return visual_equations(states.poses, cameras, landmarks, measured.structure, 2.0, 1e4, eliminated)[:3]
 
 
@@ -390,8 +390,10 @@ def moved_by(states: States, unknown: int, step: float) -> States:
 
 def calibration_unknowns(states: States) -> list[int]:
     """Return a focal length, a principal point, a coefficient and the place of the last camera, as unknowns."""
-    first = 6 * len(states.poses) + states.n_cameras - SINGLE
-    return [first, first + 3, first + INTRINSICS, *range(first + PLACE, first + SINGLE)] if states.n_cameras else []
+    if not states.n_camera_parameters:
+        return []
+    first = 6 * len(states.poses) + states.n_camera_parameters - SINGLE
+    return [first, first + 3, first + INTRINSICS, *range(first + PLACE, first + SINGLE)]
 
 
 @pytest.mark.parametrize("calibrates", [False, True])
@@ -401,7 +403,7 @@ def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_
 ) -> None:
     measured, states, landmarks, _ = problem(4, shares=shares, calibrates=calibrates)
     _, gradient, _ = at_best(measured, states, landmarks)
-    of_pixels = 6 * 4 + states.n_cameras - SINGLE + np.arange(INTRINSICS)
+    of_pixels = 6 * 4 + states.n_camera_parameters - SINGLE + np.arange(INTRINSICS)
     for unknown in [*range(24), *calibration_unknowns(states)]:
         step = 1e-3 if unknown in of_pixels else 1e-5
         after, before = (at_best(measured, moved_by(states, unknown, s), landmarks)[2] for s in (step, -step))

@@ -18,7 +18,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FactorLikelihood, FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OFFSET
-from graphvio.self_calibration.parameters import n_of_cameras
+from graphvio.self_calibration.parameters import n_camera_parameters
 from graphvio.self_calibration.prior import file_prior
 
 _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of intrinsics, and of extrinsics and the IMU
@@ -54,9 +54,9 @@ class WindowCalibration:
     def __init__(self, rig: Rig, is_estimated: bool = True) -> None:
         assert rig.imu is not None
         self._rig = rig
-        whole, n_cameras = file_prior(rig), n_of_cameras(rig)
-        self._rows = np.r_[:n_cameras, n_cameras + GYRO_MATRIX : n_cameras + PARAMETERS]
-        self._biases = n_cameras + np.arange(GYRO_MATRIX)
+        whole, n = file_prior(rig), n_camera_parameters(rig)
+        self._rows = np.r_[:n, n + GYRO_MATRIX : n + PARAMETERS]
+        self._biases = n + np.arange(GYRO_MATRIX)
         self._prior = FilePrior(
             np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]), whole.group[self._rows]
         )

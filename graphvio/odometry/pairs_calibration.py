@@ -25,7 +25,7 @@ from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction
 from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
-from graphvio.self_calibration.parameters import n_of_cameras
+from graphvio.self_calibration.parameters import n_camera_parameters
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
 _MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
@@ -143,7 +143,7 @@ class PairsCalibration:
         self._margin_px = margin_px
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(self.estimate.rig, margin_px, self._calibration.extrinsics)
-        change, n = self.estimate.difference - self._in_force, n_of_cameras(self._rig)
+        change, n = self.estimate.difference - self._in_force, n_camera_parameters(self._rig)
         self._in_force = self.estimate.difference
         if self._innovation_covariance is not None and self._innovation_covariance.recalibrate(change[:n]):
             self._frontend.start_keyframe()

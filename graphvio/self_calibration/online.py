@@ -27,7 +27,7 @@ from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Fact
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
-from graphvio.self_calibration.parameters import RigCalibration, n_of_cameras
+from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
 from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe, View
@@ -119,7 +119,7 @@ class SelfCalibration:
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
-        self._consider = ConsiderCovariance(self._n_cameras)
+        self._consider = ConsiderCovariance(self._n_camera_parameters)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="graphvio-calibration")
 
     def close(self) -> None:
@@ -217,9 +217,9 @@ class SelfCalibration:
         return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
 
     @property
-    def _n_cameras(self) -> int:
+    def _n_camera_parameters(self) -> int:
         """Number of the cameras' parameters, the first ones of all."""
-        return n_of_cameras(self._rig)
+        return n_camera_parameters(self._rig)
 
     @property
     def has_full_window(self) -> bool:
@@ -252,7 +252,7 @@ class SelfCalibration:
         if adjusted.is_full:
             self._evidence, self._refused = adjusted.evidence, 0
             self._used_windows += 1
-        solution, n_cameras = adjusted.solution, self._n_cameras
+        solution, n = adjusted.solution, self._n_camera_parameters
         if (
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
@@ -260,9 +260,9 @@ class SelfCalibration:
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         self._consider.extend(adjusted.window, adjusted.by_cameras)
-        self._consider.learn(adjusted.estimate.difference[:n_cameras], adjusted.covariance)
+        self._consider.learn(adjusted.estimate.difference[:n], adjusted.covariance)
         self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
-        self._in_force = self._nominal.moved(self.estimate.difference[:n_cameras])
+        self._in_force = self._nominal.moved(self.estimate.difference[:n])
 
     def _refuse(self, is_full: bool) -> None:
         """Discard a window that contradicts those before it; several such windows are a knock."""
@@ -332,18 +332,18 @@ class SelfCalibration:
             solution = adjusted(window, samples, self._nominal, solution.calibration.mean, prior, self._sigma_px)
             evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
         posterior = evidence.given(self._prior, _assumed(factors))
-        n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
+        n, in_force = self._n_camera_parameters, np.zeros_like(difference)
         is_changed = self._prior.change is not None
         if is_changed or (factors != EXACT).any():
             in_force = evidence.given(self._prior, factors).mean
-        covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n_cameras, :n_cameras]
+        covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n, :n]
         extrinsics = {}
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
         _ = estimate.rig  # raises where there is no such rig
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
             extrinsics = extrinsic_covariances(self._rig, anywhere.covariance)
-        by_cameras = solution.poses_by_cameras(n_cameras)
+        by_cameras = solution.poses_by_cameras(n)
         return _Adjusted(
             prior,
             solution,
