@@ -25,8 +25,8 @@ class CalibrationEstimate:
         difference: (C,) that is in force, with zero for what is exact.
         file_factors: (G,) by which factors the file's errors exceed their standard deviations: of intrinsics and
             stereo extrinsics, and of extrinsics in body and the IMU. `EXACT` where the file is as good as exact.
-        log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is very
-            strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
+        twice_log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is
+            very strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
         is_changed: whether a knock has changed the cameras since the file was made.
     """
 
@@ -34,7 +34,7 @@ class CalibrationEstimate:
     posterior: Gaussian
     difference: Float
     file_factors: Float
-    log_bayes_factor: float = 0.0
+    twice_log_bayes_factor: float = 0.0
     is_changed: bool = False
 
     @property

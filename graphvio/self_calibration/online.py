@@ -23,7 +23,14 @@ from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FactorLikelihood, Gaussian
+from graphvio.self_calibration.evidence import (
+    EXACT,
+    MAX_FACTOR,
+    MIN_TWICE_LOG_BAYES_FACTORS,
+    Evidence,
+    FactorLikelihood,
+    Gaussian,
+)
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
@@ -36,8 +43,6 @@ _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
-"""Against exact files, of cameras and of extrinsics. Cameras that are not exact reach hundreds with the first image."""
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
@@ -325,12 +330,12 @@ class SelfCalibration:
         """Adjust a window; what is read here does not change while an adjustment is pending."""
         await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
-        evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
+        evidence, likelihood, factors, twice_log_bayes_factor = self._judged(prior, solution)
         if solution.has_converged and not np.array_equal(_assumed(factors), assumed):
             # What the window says was linearised where another file led it.
             prior = self._evidence.given(self._prior, _assumed(factors))
             solution = adjusted(window, samples, self._nominal, solution.calibration.mean, prior, self._sigma_px)
-            evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
+            evidence, likelihood, factors, twice_log_bayes_factor = self._judged(prior, solution)
         posterior = evidence.given(self._prior, _assumed(factors))
         n, in_force = self._n_camera_parameters, np.zeros_like(difference)
         is_changed = self._prior.change is not None
@@ -338,7 +343,7 @@ class SelfCalibration:
             in_force = evidence.given(self._prior, factors).mean
         covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n, :n]
         extrinsics = {}
-        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
+        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, twice_log_bayes_factor, is_changed)
         _ = estimate.rig  # raises where there is no such rig
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
@@ -361,7 +366,7 @@ class SelfCalibration:
         """Return what a window and those before say, its likelihood, the file's factors, and their Bayes factor."""
         evidence = self._evidence.with_window(prior, solution.calibration)
         likelihood = FactorLikelihood(evidence, self._prior)
-        return evidence, likelihood, *evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
+        return evidence, likelihood, *evidence.file_factors(self._prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood)
 
 
 def warm_up_adjustment(rig: Rig) -> None:
