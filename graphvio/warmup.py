@@ -144,7 +144,7 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     if rig.singles:
         history = MotionHistory()
         history.restart(frame.stamp_ns)
-        FirstSights().locate(frame.ids, frame.left, history, np.eye(4), 1.0, 1.0)
+        FirstSights().locate(frame.ids, frame.left_rays, history, np.eye(4), 1.0, 1.0)
     if not rig.pairs:
         _track_singles(rig, config, rng)
     if any(camera.line_time_us for camera in rig.cameras):

@@ -112,8 +112,8 @@ class SinglesFrontend(TrackingFrontend):
         def find(j: int) -> CameraTracks:
             chosen = ~of_others[j] if wanted is None else wanted[j]
             self._overlaps.find(j, views, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
-            handed_over = self._handover.handed_over(j, frames[j])
-            return CameraTracks(frames[j].ids, frames[j].left, self._overlaps.matches_of(j, frames[j]), handed_over)
+            matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
+            return CameraTracks(frames[j].ids, frames[j].left_rays, matches, handed_over)
 
         return self._in_parallel(find, frames)
 
@@ -186,12 +186,12 @@ class SinglesFrontend(TrackingFrontend):
             if cur_T_reference is None:
                 since_ns = reference.stamp_ns
                 cur_T_reference = motion_since(since_ns)
-            rays = np.column_stack([reference.left[then], np.ones(len(then))])
+            rays = np.column_stack([reference.left_rays[then], np.ones(len(then))])
             if cur_T_reference is not None:
                 body_R_cam = self._extrinsics.arrays.body_T_left[j][:3, :3]
                 rays = rays @ (body_R_cam.T @ cur_T_reference[:3, :3] @ body_R_cam).T
             ahead = rays[:, 2] > 0.1
-            moved = frame.left[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]
+            moved = frame.left_rays[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]
             displacements.append(np.hypot(moved[:, 0], moved[:, 1]))
         return float(np.median(np.concatenate(displacements))), since_ns, cur_T_reference is not None
 

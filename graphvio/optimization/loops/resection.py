@@ -161,7 +161,7 @@ def _registered(
     left_T_left = camera.cam_T_body @ cur_T_ref @ camera.body_T_cam
     depth = np.where(known.has_depth, np.maximum(known.points[:, 2], 0.0), 0.0)
     guess, inverse_depths, valid = predict_pixels(
-        known.left, depth, left_T_left, camera.model_number, camera.intrinsics, camera.distortion
+        known.left_rays, depth, left_T_left, camera.model_number, camera.intrinsics, camera.distortion
     )
     rows = np.flatnonzero(valid & known.has_depth & camera.contains(guess, 8.0))
     pixels, at = patches.find(known.ids[rows], guess[rows], images[0], left_T_left, MIN_GRADIENT)
@@ -187,8 +187,8 @@ def _observations(
                 np.full(len(rows), number),
                 then.points[one],
                 then.covariances[one],
-                now.left[other],
-                np.where(right[:, None], now.right[other], 0.0),
+                now.left_rays[other],
+                np.where(right[:, None], now.right_rays[other], 0.0),
                 right,
             )
         )
