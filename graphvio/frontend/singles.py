@@ -13,7 +13,7 @@ from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracking_frontend import MotionPredictor, Seen, TrackingFrontend
+from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet
@@ -77,7 +77,7 @@ class SinglesFrontend(TrackingFrontend):
             camera_tracks={} if self._all_frozen else camera_tracks,
         )
 
-    def _advance_history(self, seen: Seen, motion_since: MotionPredictor) -> None:
+    def _advance_history(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> None:
         """Note the predicted motion since the keyframe before, by which the new one locates points."""
         reference = next(iter(seen.reference.values()), None)
         cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
@@ -85,7 +85,9 @@ class SinglesFrontend(TrackingFrontend):
             for j in seen.frames:
                 self._histories[j].advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
 
-    def _begin_keyframe(self, seen: Seen, motion_since: MotionPredictor) -> tuple[Seen, dict[int, CameraTracks]]:
+    def _begin_keyframe(
+        self, seen: TrackedFrameset, motion_since: MotionPredictor
+    ) -> tuple[TrackedFrameset, dict[int, CameraTracks]]:
         """Register later tracks on these images, with handed over and new ones, which other cameras may see, too."""
         before = seen.frames
         seen = seen._replace(frames=self._refer_to(self._handed_over(before)))

@@ -35,7 +35,7 @@ MotionPredictor = Callable[[int], Float | None]
 _Result = TypeVar("_Result")
 
 
-class Seen(NamedTuple):
+class TrackedFrameset(NamedTuple):
     """Tracks of a frameset.
 
     Attributes:
@@ -156,7 +156,7 @@ class TrackingFrontend(ABC):
         motion_since: MotionPredictor,
         readout: ReadoutMotion | None,
         rotation_since: MotionPredictor | None,
-    ) -> Seen:
+    ) -> TrackedFrameset:
         """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
         self._all_frozen = frozen.all_since_ns is not None
@@ -184,7 +184,7 @@ class TrackingFrontend(ABC):
         for stage in ("pyramid", "register", "flow", "stereo"):
             self.stage_ms[stage] = max((frame.stage_ms[stage] for frame in frames.values()), default=0.0)
         reference = self._references.shared(frames)
-        return Seen(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
+        return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
 
     def _in_parallel(self, work: Callable[[int], _Result], pairs: Iterable[int]) -> dict[int, _Result]:
         """Work on each pair, all but the first in threads of their own."""

@@ -16,12 +16,12 @@ from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import is_of_singles, with_free_length
 from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
-from graphvio.frontend.quality import GradedHypothesis, graded, graded_hypothesis, stereo_share
+from graphvio.frontend.quality import CheckedHypothesis, checked_hypothesis, motion_with_quality, stereo_share
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracking_frontend import MotionPredictor, Seen, TrackingFrontend
+from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
@@ -30,7 +30,7 @@ from graphvio.rig import Rig
 from graphvio.timing import timed
 
 
-class _Graded(NamedTuple):
+class _JudgedMotion(NamedTuple):
     """The motion of a frameset, how far it can be trusted and why, and contradicting hypotheses."""
 
     motion: RelativeMotion | None
@@ -113,16 +113,16 @@ class VisualFrontend(TrackingFrontend):
         self.stage_ms = {}
         seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
         agreement, reason = self._estimate_motion(seen, motion_since)
-        graded_motion = self._grade(seen, agreement, reason, motion_since)
+        judged = self._judge(seen, agreement, reason, motion_since)
         is_stationary = self._detect_standstill(seen, agreement)
         self._drop_outliers(seen, agreement)
-        replenished, own = self._replenish(seen, agreement, motion_since)
+        replenished, own = self._start_keyframe_if_due(seen, agreement, motion_since)
         return VisualResult(
-            graded_motion.motion,
-            graded_motion.quality,
-            graded_motion.reason,
+            judged.motion,
+            judged.quality,
+            judged.reason,
             pair_reports(seen.frames if seen.reference else replenished, seen.correspondences, agreement, replenished),
-            alternatives=graded_motion.alternatives,
+            alternatives=judged.alternatives,
             own=own,
             is_stationary=is_stationary,
             frozen=seen.frozen.pairs,
@@ -130,7 +130,7 @@ class VisualFrontend(TrackingFrontend):
         )
 
     @timed("motion")
-    def _estimate_motion(self, seen: Seen, motion_since: MotionPredictor) -> tuple[Agreement | None, str]:
+    def _estimate_motion(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> tuple[Agreement | None, str]:
         """Estimate the motion from all pairs, eq. (1) to (4), or return None and why there is none."""
         if not seen.reference:
             return None, seen.frozen.reason if self._all_frozen or not seen.frames else "first images"
@@ -159,28 +159,30 @@ class VisualFrontend(TrackingFrontend):
         return agreement, ""
 
     @timed("quality")
-    def _grade(self, seen: Seen, agreement: Agreement | None, reason: str, motion_since: MotionPredictor) -> _Graded:
+    def _judge(
+        self, seen: TrackedFrameset, agreement: Agreement | None, reason: str, motion_since: MotionPredictor
+    ) -> _JudgedMotion:
         """Decide how far the motion can be trusted."""
         if agreement is None:
-            return _Graded(None, Quality.FAILED, reason)
+            return _JudgedMotion(None, Quality.FAILED, reason)
         arrays, observations = self._extrinsics.arrays, seen.correspondences.observations
         predicted = motion_since(seen.reference_stamp_ns) if self._rig.singles else None
 
         def with_length(motion: RelativeMotion, hypothesis: MotionHypothesis) -> RelativeMotion:
             return with_free_length(arrays, observations, hypothesis.refined, motion, predicted)
 
-        hypotheses, best = self._graded_hypotheses(seen, agreement), agreement.hypotheses[0]
+        hypotheses, best = self._checked_hypotheses(seen, agreement), agreement.hypotheses[0]
         has_length = not is_of_singles(arrays, observations, best.refined)
-        motion, quality, reason = graded(hypotheses, agreement.max_distance, has_length=has_length)
+        motion, quality, reason = motion_with_quality(hypotheses, agreement.max_distance, has_length=has_length)
         alternatives = tuple(
-            replace(with_length(graded_one.motion, hypothesis), pairs=hypothesis.pairs)
-            for graded_one, hypothesis in zip(hypotheses, agreement.hypotheses, strict=True)
+            replace(with_length(checked_one.motion, hypothesis), pairs=hypothesis.pairs)
+            for checked_one, hypothesis in zip(hypotheses, agreement.hypotheses, strict=True)
             if len(hypotheses) > 1
         )
-        return _Graded(with_length(motion, best), quality, reason, alternatives)
+        return _JudgedMotion(with_length(motion, best), quality, reason, alternatives)
 
     @timed("quality")
-    def _detect_standstill(self, seen: Seen, agreement: Agreement | None) -> bool:
+    def _detect_standstill(self, seen: TrackedFrameset, agreement: Agreement | None) -> bool:
         """Return whether the points that the motion explains have stood still for a while; False without a motion."""
         if agreement is None:
             return False
@@ -188,7 +190,7 @@ class VisualFrontend(TrackingFrontend):
         return self._standstill.update(seen.frames, explained)
 
     @timed("quality")
-    def _drop_outliers(self, seen: Seen, agreement: Agreement | None) -> None:
+    def _drop_outliers(self, seen: TrackedFrameset, agreement: Agreement | None) -> None:
         """Drop the tracks that the motion does not explain; none without a motion."""
         if agreement is None:
             return
@@ -196,10 +198,10 @@ class VisualFrontend(TrackingFrontend):
             self._trackers[j].drop(seen.frames[j].ids[rows[~inliers_of(j, seen.correspondences, agreement)]])
 
     @timed("replenish")
-    def _replenish(
-        self, seen: Seen, agreement: Agreement | None, motion_since: MotionPredictor
+    def _start_keyframe_if_due(
+        self, seen: TrackedFrameset, agreement: Agreement | None, motion_since: MotionPredictor
     ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
-        """Start a keyframe with new corners if it is time to, and learn from the pairs' own motions until then.
+        """Start a keyframe with new corners if it is time to, with what the one that ends has shown.
 
         Returns:
             Pair index -> tracks with new corners, and pair index -> its own motion over the keyframe; empty where the
@@ -213,25 +215,29 @@ class VisualFrontend(TrackingFrontend):
         own = self._own_motions(seen, agreement)
         self._extrinsics.learn(agreement.own)
         self._move_trackers()
+        self._advance_histories(seen, refined, motion_since)
+        return self._refer_to(seen.frames), own
+
+    # ------------------------------------------------------------------ parts of these steps
+
+    def _advance_histories(self, seen: TrackedFrameset, refined: Refined, motion_since: MotionPredictor) -> None:
+        """Note the motion over the keyframe that ends, by which single cameras locate points."""
         # Depths by a motion of single cameras alone would have the scale of earlier depths: that of the state is known.
         are_singles = is_of_singles(self._extrinsics.arrays, seen.correspondences.observations, refined)
         predicted = motion_since(seen.reference_stamp_ns) if are_singles else None
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
         for j in seen.frames:
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
-        return self._refer_to(seen.frames), own
-
-    # ------------------------------------------------------------------ parts of these steps
 
     def _is_in_doubt(self, now_ns: int) -> bool:
         """Whether the pairs contradicted each other a moment ago."""
         return self._contradicted_ns is not None and 0 <= now_ns - self._contradicted_ns < THRESHOLDS.agreement.doubt_ns
 
-    def _graded_hypotheses(self, seen: Seen, agreement: Agreement) -> list[GradedHypothesis]:
+    def _checked_hypotheses(self, seen: TrackedFrameset, agreement: Agreement) -> list[CheckedHypothesis]:
         """Check each motion hypothesis on its own."""
         stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
         return [
-            graded_hypothesis(
+            checked_hypothesis(
                 self._with_depth_errors(self._relative_motion(seen, hypothesis.refined), seen, hypothesis.refined),
                 seen.frozen.all_since_ns,
                 stereo,
@@ -240,7 +246,7 @@ class VisualFrontend(TrackingFrontend):
             for hypothesis in agreement.hypotheses
         ]
 
-    def _relative_motion(self, seen: Seen, refined: Refined) -> RelativeMotion:
+    def _relative_motion(self, seen: TrackedFrameset, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
         angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3].copy())), np.linalg.norm(ref_T_cur[:3, 3])
         scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
@@ -254,7 +260,7 @@ class VisualFrontend(TrackingFrontend):
             int(refined.inlier.sum()),
         )
 
-    def _with_depth_errors(self, motion: RelativeMotion, seen: Seen, refined: Refined) -> RelativeMotion:
+    def _with_depth_errors(self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined) -> RelativeMotion:
         """Add the derivatives by errors of the pairs' depths, by which an IMU may contradict the motion."""
         if not self._config.estimates_calibration or self._rig.imu is None:
             return motion
@@ -262,7 +268,7 @@ class VisualFrontend(TrackingFrontend):
         derivatives = by_depth_errors(self._extrinsics.arrays, observations, refined.inlier, cur_T_ref)
         return replace(motion, by_depth_errors=derivatives)
 
-    def _own_motions(self, seen: Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
+    def _own_motions(self, seen: TrackedFrameset, agreement: Agreement) -> dict[int, RelativeMotion]:
         """Return each pair's own motion without the corrections in force; with one pair alone, that is the rig's."""
         first = agreement.hypotheses[0]
         alone = {first.pairs[0]: first.refined} if len(self._rig.groups) == 1 else {}
