@@ -172,7 +172,7 @@ class PairsCalibration:
         self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + self.estimate.time_offset_s
-            self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
+            self._synchroniser.add_to_time_offset(wanted_s - self._synchroniser.time_offset_s)
 
     def _turn(self) -> Float | None:
         """Return how the body of the calibration in force is turned, see `OnlineCalibration.update`."""

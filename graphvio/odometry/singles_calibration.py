@@ -112,7 +112,7 @@ class SinglesCalibration:
             return
         self._estimate = estimate
         shift_s = self._imu.time_offset_s + estimate.time_offset_s - self._synchroniser.time_offset_s
-        self._synchroniser.shift_imu(shift_s)
+        self._synchroniser.add_to_time_offset(shift_s)
         self._estimator.shift_samples(round(shift_s * 1e9))
         wrong = contradiction(self.findings)
         if wrong is not None and self._was_wrong and not self._is_reported:
