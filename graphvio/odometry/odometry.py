@@ -65,20 +65,17 @@ class _Predicted(NamedTuple):
     initialisations: int  # until then
 
 
-def _config_of(rig: Rig, config: Config) -> Config:
-    """Return the configuration, if the rig allows it.
+def _check_config(rig: Rig, config: Config) -> None:
+    """Check that the rig has what the configuration asks for.
 
     Raises:
         ConfigError: If the configuration asks for what such a rig does not have.
     """
-    if rig.pairs:
-        return config
-    if config.fusion.estimator == "filter" or config.fusion.estimate_time_offset:
+    if not rig.pairs and (config.fusion.estimator == "filter" or config.fusion.estimate_time_offset):
         raise ConfigError(
             "the paper's filter and the estimation of the time offset need a stereo pair, and the rig has none; use "
             "fusion.estimator: smoother and fusion.estimate_time_offset: false"
         )
-    return config
 
 
 def _frontend_class(rig: Rig) -> type[VisualFrontend | SinglesFrontend]:
@@ -119,7 +116,8 @@ class Odometry:
         image_mask: ImageMask | None = None,
     ) -> None:
         self.rig = rig
-        self.config = _config_of(rig, config or Config())
+        self.config = config or Config()
+        _check_config(rig, self.config)
         self.stage_ms: dict[str, float] = {}
         self._frontend: TrackingFrontend = _frontend_class(rig)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
@@ -415,7 +413,8 @@ class Odometry:
         self._calibration.add(stamp_ns, visual.quality, status)
         old_R_new = self._calibration.update(stamp_ns)
         if old_R_new is not None:
-            self._calibration.correct_pose(self._nav.turn(stamp_ns, self._estimator.state().nav_T_body, old_R_new))
+            turned = self._nav.turn(stamp_ns, self._estimator.state().nav_T_body, old_R_new)
+            self._calibration.correct_pose(turned)
 
     def _publish(
         self,
