@@ -112,7 +112,7 @@ class PairsCalibration:
         calibration, estimator = self._calibration, self._estimator
         if self._innovation_covariance is not None:
             references = self._frontend.reference_stamps_ns
-            self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.widest)
+            self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.upper_covariance)
         is_urgent = self._frontend.are_lines_off
         # Until the calibration is trusted, motions may be refused because of it.
         is_refused = status is Status.COASTING and not calibration.is_trusted

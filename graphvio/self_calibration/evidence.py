@@ -107,7 +107,7 @@ class Evidence(NamedTuple):
         information = self.information + np.linalg.inv(prior.with_factors(factors))
         return Gaussian(np.asarray(np.linalg.solve(information, self.vector)), np.asarray(information))
 
-    def forgotten(self, walk: Float) -> Evidence:
+    def after_random_walk(self, walk: Float) -> Evidence:
         """Return the likelihood after a random walk of the calibration with a covariance (C, C)."""
         kept = np.linalg.inv(np.eye(len(walk)) + self.information @ walk)
         information = kept @ self.information

@@ -74,7 +74,7 @@ class _Adjusted(NamedTuple):
     evidence: Evidence
     estimate: CalibrationEstimate
     extrinsics: dict[int, Float]
-    widest: Float
+    upper_covariance: Float
     covariance: Float  # of the cameras' parameters that come into force
     by_cameras: Float
     window: tuple[Keyframe, ...]
@@ -92,7 +92,8 @@ class SelfCalibration:
         extrinsics: index of a pair or single camera -> covariance (6, 6) of its pose relative to the first pair, see
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
-        widest: (C, C) covariance of what is known, if the file may be as wrong as any.
+        upper_covariance: (C, C) covariance of the calibration if the rig file's standard deviations are all scaled by
+            `MAX_FACTOR`; used by the innovation test.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
     """
@@ -101,8 +102,8 @@ class SelfCalibration:
         self._rig = rig
         self._nominal = RigCalibration.of(rig)
         self._prior = file_prior(rig)
-        widest = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
-        self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(widest)))
+        upper_covariance = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
+        self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(upper_covariance)))
         self._walk = walk_per_second(rig, self._prior, WALK)
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         n_groups = self._prior.n_groups
@@ -110,7 +111,7 @@ class SelfCalibration:
         exact = np.full(n_groups, EXACT)
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.extrinsics: dict[int, Float] = {}
-        self.widest = widest
+        self.upper_covariance = upper_covariance
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
         self._in_force = self._nominal
@@ -265,8 +266,9 @@ class SelfCalibration:
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         self._consider.extend(adjusted.window, adjusted.by_cameras)
-        self._consider.learn(adjusted.estimate.difference[:n], adjusted.covariance)
-        self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
+        self._consider.set_calibration_in_force(adjusted.estimate.difference[:n], adjusted.covariance)
+        self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
+        self.upper_covariance = adjusted.upper_covariance
         self._in_force = self._nominal.moved(self.estimate.difference[:n])
 
     def _refuse(self, is_full: bool) -> None:
@@ -288,7 +290,7 @@ class SelfCalibration:
         """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
         self._drop_pending()
         change = knock_covariance(self._rig, len(self._walk), groups)
-        self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
+        self._evidence, self._prior = self._evidence.after_random_walk(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self._used_windows, self._agreeing, self._refused = 0, 0, 0
         self.restarts += 1
@@ -310,7 +312,7 @@ class SelfCalibration:
         if is_full := len(window) >= WINDOW:
             self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
-            self._evidence = self._evidence.forgotten(duration_s * self._walk)
+            self._evidence = self._evidence.after_random_walk(duration_s * self._walk)
         assumed = _assumed(self.estimate.file_factors)
         prior = self._evidence.given(self._prior, assumed)
         samples, difference = self._collector.samples_of(window), self.estimate.posterior.mean
