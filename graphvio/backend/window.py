@@ -71,8 +71,10 @@ class GraphWindow:
                     raise WindowError("the window's solution is not finite")
                 is_last = largest < _CONVERGED and iteration >= self._min_iterations
                 moved = self.values.retract(step) if is_last else self._improved(step)
-                self.values = moved or self.values
-                self._marginal = self._marginal and self._marginal.at_solution()
+                if moved is not None:
+                    self.values = moved
+                if self._marginal is not None:
+                    self._marginal = self._marginal.at_solution()
                 if is_last or moved is None:
                     break
         except RuntimeError as error:
