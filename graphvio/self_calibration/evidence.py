@@ -179,14 +179,15 @@ class FactorLikelihood:
 
     def _computed(self, factors: Float) -> float:
         prior, evidence = self._prior, self._evidence
-        each = prior.of_each(factors)
-        prior_information: Float = self._information / (each * each[:, None])
+        factor_of_each = prior.of_each(factors)
+        prior_information: Float = self._information / (factor_of_each * factor_of_each[:, None])
+        scales = factor_of_each  # their product is the root of the prior's determinant, up to a constant
         if prior.change is not None:
             covariance = prior.with_factors(factors)
-            prior_information, each = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
+            prior_information, scales = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
         lower = cholesky(evidence.information + prior_information)
         fitted = solve_lower(lower, evidence.vector.reshape(1, -1))[0]
-        likelihood = float(fitted @ fitted - 2.0 * np.log(each * np.diag(lower)).sum())
+        likelihood = float(fitted @ fitted - 2.0 * np.log(scales * np.diag(lower)).sum())
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite
 
 
