@@ -1,4 +1,4 @@
-"""Estimates and keyframe data, put together from what the stages return."""
+"""Estimates, keyframe data and views for the calibration, put together from what the stages return."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.step import NewKeyframe
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
+from graphvio.self_calibration.window import View
 
 
 def estimate_without_pose(stamp_ns: int, visual: VisualResult, stage_ms: Mapping[str, float]) -> Estimate:
@@ -143,3 +144,11 @@ def keyframe_of(
         covariance=covariance,
         located_points=estimator.located_points,
     )
+
+
+def views_at(frontend: TrackingFrontend, stamp_ns: int) -> dict[int, View]:
+    """Return what pairs and single cameras, by their index, see at the newest frameset, if it has this stamp."""
+    return {
+        j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
+        for j, frame in frontend.frames_at(stamp_ns).items()
+    }

@@ -16,8 +16,8 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import CORRECTED, EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
+from graphvio.odometry.assembly import views_at
 from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
-from graphvio.odometry.online_calibration import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FullWindow

@@ -13,7 +13,7 @@ from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.monocular.estimator import MonocularEstimator
-from graphvio.odometry.online_calibration import views_at
+from graphvio.odometry.assembly import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
