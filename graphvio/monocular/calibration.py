@@ -153,7 +153,7 @@ class WindowCalibration:
     def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Return whether a first window, adjusted with an exact file, says that its extrinsics or IMU are far off.
 
-        Arguments as `doubts_file`.
+        Arguments as `update_factors`.
         """
         if not (self.size and self.are_stamps_exact):
             return False
@@ -161,7 +161,7 @@ class WindowCalibration:
         as_stated, far_off = (likelihood(np.array([_MIN_FACTOR, factor])) for factor in (EXACT, _FAR_OFF))
         return bool(far_off - as_stated > MIN_TWICE_LOG_BAYES_FACTORS[1])
 
-    def doubts_file(self, adjusted: Adjusted, prior: Prior | None) -> bool:
+    def update_factors(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Update the factors of the rig file from a window, and return whether they have changed.
 
         Args:

@@ -113,7 +113,7 @@ class Initialiser:
         if is_stationary or len(self._keyframes) < min_keyframes or duration_s < min_duration_s:
             self.reason = "the images show too little motion"
             return None
-        for factors in self._candidates():
+        for factors in self._next_candidates():
             try:
                 window = self._solved(factors)
             except (np.linalg.LinAlgError, MeasurementError) as error:
@@ -123,8 +123,8 @@ class Initialiser:
                 return window
         return None
 
-    def _candidates(self) -> list[Float]:
-        """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
+    def _next_candidates(self) -> list[Float]:
+        """Return by which factors (G,) the rig file may be wrong, the likeliest first, and count the attempt."""
         if self._is_file_doubted:  # every other keyframe: each attempt takes as long as many framesets
             self._keyframes_in_doubt += 1
             return self._calibration.candidates[1:] if self._keyframes_in_doubt % 2 else []

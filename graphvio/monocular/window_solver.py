@@ -119,7 +119,7 @@ class WindowSolver:
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
         adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
-        if is_keyframe and calibration.doubts_file(adjusted, window.prior):
+        if is_keyframe and calibration.update_factors(adjusted, window.prior):
             measured, places = adjusted.measured, adjusted.landmarks
             adjusted = adjust(measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file())
         window.states = adjusted.states
