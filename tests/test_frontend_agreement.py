@@ -16,7 +16,7 @@ from graphvio.frontend.observations import Correspondences, Observations, RigArr
 from graphvio.frontend.pair_reports import pair_reports
 from graphvio.frontend.quality import StereoShare, checked_hypothesis, motion_with_quality, stereo_share
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import joint_motion_known_depths
+from graphvio.frontend.selection import searched_and_refined
 from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.frontend.visual import VisualFrontend
@@ -40,7 +40,7 @@ def agreement_of(
     uncertain: Mapping[int, Float] | None = None,
 ) -> Agreement:
     rng = np.random.default_rng(seed)
-    joint = joint_motion_known_depths(arrays, seen, STILL, CONFIG, rng)
+    joint = searched_and_refined(arrays, seen, STILL, CONFIG, rng)
     return agree(arrays, seen, joint, CONFIG, rng, uncertain or {}, in_doubt)
 
 

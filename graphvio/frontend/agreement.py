@@ -77,7 +77,7 @@ def agree(
     Args:
         rig: P pairs.
         observations: Points of any subset of them.
-        joint: `graphvio.frontend.selection.joint_motion_known_depths` of these.
+        joint: `graphvio.frontend.selection.searched_and_refined` of these.
         config: Configuration of the motion stage.
         rng: Source of random triples.
         uncertain: Pair index -> covariance (6, 6) of an error d of its extrinsics, which are ``exp(d) body_T_left``, of
