@@ -147,7 +147,7 @@ def test_refine_finds_a_minimum_of_the_cost() -> None:
     seen = seen_points(RIG, TRUTH, 25, seed(6), sigma_px=0.3)
     seen = seen._replace(has_right=seed(7).random(50) < 0.8)
     everyone = np.ones(50, dtype=bool)  # known, so that both pairs count for the same
-    refined = refine(ARRAYS, seen, TRUTH, CONFIG, known=everyone)
+    refined = refine(ARRAYS, seen, TRUTH, CONFIG, known_inlier=everyone)
     lowest = eliminated_cost(seen, refined.cur_T_ref, CONFIG)
     steps = 0.3 * np.sqrt(np.diag(refined.covariance))
     for axis in range(6):

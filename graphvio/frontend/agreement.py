@@ -165,7 +165,7 @@ def _own_motion(
         return _own_motion_of_single(rig, seen, joint, config)
     share = float(inlier.mean())
     if share >= _T.min_joint_share:
-        return refine(rig, seen, joint.cur_T_ref, config, known=inlier)
+        return refine(rig, seen, joint.cur_T_ref, config, known_inlier=inlier)
     start = joint.cur_T_ref
     if share < _T.max_searched_share:
         start = search(rig, seen, start, config, rng)

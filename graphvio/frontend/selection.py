@@ -29,8 +29,10 @@ def searched_and_refined(
         config: of this stage.
         rng: source of the random triples.
     """
-    known = is_depth_known(rig, observations, config.pixel_sigma_px)
-    searched = observations if known.all() or not known.any() else observations.of_rows(known)
+    has_known_depth = is_depth_known(rig, observations, config.pixel_sigma_px)
+    searched = observations
+    if has_known_depth.any() and not has_known_depth.all():
+        searched = observations.of_rows(has_known_depth)
     return refine(rig, observations, search(rig, searched, predicted, config, rng), config)
 
 
@@ -47,13 +49,15 @@ def joint_motion(
     Returns:
         The motion on all points, and the observations with that noise.
     """
-    known = is_depth_known(rig, observations, config.pixel_sigma_px)
-    if known.all() or known.sum() < config.min_inliers:
+    has_known_depth = is_depth_known(rig, observations, config.pixel_sigma_px)
+    if has_known_depth.all() or has_known_depth.sum() < config.min_inliers:
         refined = searched_and_refined(rig, observations, predicted, config, rng)
         return with_unknown_scales(rig, observations, refined, config), observations
-    first = searched_and_refined(rig, observations.of_rows(known), predicted, config, rng)
-    covariances, pair = observations.covariances.copy(), observations.pair[~known]
-    covariances[~known] = _with_noise_of_motion(covariances[~known], pair, rig, first, config.pixel_sigma_px)
+    first = searched_and_refined(rig, observations.of_rows(has_known_depth), predicted, config, rng)
+    covariances, is_vague = observations.covariances.copy(), ~has_known_depth
+    covariances[is_vague] = _with_noise_of_motion(
+        covariances[is_vague], observations.pair[is_vague], rig, first, config.pixel_sigma_px
+    )
     observations = observations._replace(covariances=covariances)
     refined = refine(rig, observations, first.cur_T_ref, config)
     return with_unknown_scales(rig, observations, refined, config), observations
