@@ -25,7 +25,7 @@ from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 
-FIRST_SIGMA_PX = 0.3
+FIRST_MONOCULAR_SIGMA_PX = 0.3
 _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.12, 0.6
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
 _NOISE_GAIN = 0.1  # of one keyframe
@@ -72,7 +72,7 @@ class WindowSolver:
         self.covariance = NO_COVARIANCE
         self.first_pose_ns = 0
         self._cameras = cameras
-        self._sigma_px = FIRST_SIGMA_PX
+        self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None

@@ -16,7 +16,7 @@ from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.assembly import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
-from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
+from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction, findings
 from graphvio.self_calibration.prior import file_prior
@@ -95,7 +95,7 @@ class SinglesCalibration:
             return
         if len(self._collector.keyframes) >= WINDOW:  # by now the IMU covers the last one
             window, self._collector.keyframes = tuple(self._collector.keyframes), []
-            self._on_full_window(FullWindow(window, self._collector.samples_of(window), FIRST_SIGMA_PX))
+            self._on_full_window(FullWindow(window, self._collector.samples_of(window), FIRST_WINDOW_SIGMA_PX))
         if self._estimator.epoch != self._epoch:
             self._epoch = self._estimator.epoch
             self._collector.restart()

@@ -20,7 +20,7 @@ from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
-from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
+from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import (
@@ -118,7 +118,7 @@ class SelfCalibration:
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
-        self._sigma_px = FIRST_SIGMA_PX
+        self._sigma_px = FIRST_WINDOW_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
         self._used_windows = 0  # full ones, without those that are left out
@@ -381,7 +381,7 @@ def warm_up_adjustment(rig: Rig) -> None:
         calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
     prior = calibration.estimate.posterior
     samples = calibration._collector.samples_of(keyframes)
-    adjusted(keyframes, samples, calibration._nominal, prior.mean, prior, FIRST_SIGMA_PX)
+    adjusted(keyframes, samples, calibration._nominal, prior.mean, prior, FIRST_WINDOW_SIGMA_PX)
     calibration.close()
     information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
     solve_lower(cholesky(information), right)
