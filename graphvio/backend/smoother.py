@@ -92,7 +92,7 @@ class Smoother:
         k = self._append(stamp_ns, state)
         self._constrained_ns, self._seen_ns = stamp_ns, None
         to_nav = se3_adjoint(state.nav_T_body)
-        self._nav_covariance = to_nav @ uncertainty.of_nav @ to_nav.T
+        self._nav_covariance = to_nav @ uncertainty.nav_covariance @ to_nav.T
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
         if self.has_imu:

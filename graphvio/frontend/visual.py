@@ -56,8 +56,9 @@ class VisualFrontend(TrackingFrontend):
         self._baselines_m = _baselines_m(rig)
         # Errors of focal lengths and baselines scale all motions alike. No residual shows that, and an IMU must not be
         # corrected by it; without an IMU nothing shows the scale, and as noise it would only be smoothed.
-        of_file = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
-        self._scale_sigma = 0.0 if rig.imu is None else float(np.hypot(config.motion.shared_error_share, of_file))
+        file_error_share = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
+        error_share = float(np.hypot(config.motion.shared_error_share, file_error_share))
+        self._scale_sigma = 0.0 if rig.imu is None else error_share
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
 
     @property

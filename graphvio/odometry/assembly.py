@@ -81,13 +81,13 @@ def with_state(
         calibration: Knows what its errors add to the covariance of the pose.
         nav: Frame of the estimate.
     """
-    of_calibration = calibration.pose_covariance(estimator.state().nav_T_body)
+    calibration_covariance = calibration.pose_covariance(estimator.state().nav_T_body)
     state, covariance = nav.state(estimator.state()), nav.covariance(estimator.covariance)
     has_pose, has_imu = estimate.status is not Status.LOST, estimator.has_imu
     return replace(
         estimate,
         nav_T_body=state.nav_T_body if has_pose else None,
-        covariance=covariance.pose + of_calibration if has_pose else None,
+        covariance=covariance.pose + calibration_covariance if has_pose else None,
         epoch=estimator.epoch,
         velocity_nav=state.velocity_nav if has_pose else None,
         gyro_bias=state.gyro_bias if has_imu else None,
