@@ -24,12 +24,11 @@ from graphvio.monocular.sightings import far_off
 from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
+from graphvio.self_calibration.pixel_noise import pixel_noise
 
 FIRST_MONOCULAR_SIGMA_PX = 0.3
-_MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.12, 0.6
-_NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
+_MAX_SIGMA_PX = 0.6
 _NOISE_GAIN = 0.1  # of one keyframe
-_RAYLEIGH_MEDIAN = 1.1774
 _STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
@@ -177,8 +176,7 @@ class WindowSolver:
         """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
         window.names.note_keyframe()
         if len(adjusted.equations.errors2):
-            noise = np.sqrt(np.median(adjusted.equations.errors2)) / _RAYLEIGH_MEDIAN * self._sigma_px
-            wanted = float(np.clip(_NOISE_FACTOR * noise, _MIN_SIGMA_PX, _MAX_SIGMA_PX))
+            wanted = min(pixel_noise(adjusted.equations.errors2, self._sigma_px), _MAX_SIGMA_PX)
             self._sigma_px += _NOISE_GAIN * (wanted - self._sigma_px)
         while len(window.states.poses) > MAX_KEYFRAMES:
             self._forget_first(window)

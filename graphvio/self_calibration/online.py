@@ -35,14 +35,12 @@ from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
+from graphvio.self_calibration.pixel_noise import pixel_noise
 from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe, View
 
-_MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
-_NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
-_RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
@@ -263,8 +261,7 @@ class SelfCalibration:
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
         ):
-            noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
-            self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
+            self._sigma_px = pixel_noise(solution.errors2, self._sigma_px)
         self._consider.extend(adjusted.window, adjusted.by_cameras)
         self._consider.set_calibration_in_force(adjusted.estimate.difference[:n], adjusted.covariance)
         self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
