@@ -181,8 +181,8 @@ class MonocularEstimator:
         if imu is not None:
             attitude = initial_attitude(*imu, self._config.initialisation)
             if attitude.is_stationary:
-                self._initialiser.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
-                self._trust.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
+                self._initialiser.set_gyro_bias_prior(attitude.gyro_bias, attitude.gyro_bias_sigma)
+                self._trust.set_gyro_bias_prior(attitude.gyro_bias, attitude.gyro_bias_sigma)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Add a state by the IMU; where that has been silent for 5 s, the epoch ends."""

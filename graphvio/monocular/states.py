@@ -131,3 +131,8 @@ def visual_columns(n: int, n_camera_parameters: int, n_free: int) -> Int:
     """Return where the unknowns of `visual_equations` are: poses, and cameras unless the calibration is known."""
     known = 9 * n + GRAVITY + BIASES
     return np.concatenate([np.arange(6 * n), known + np.arange(n_camera_parameters if n_free else 0)])
+
+
+def size_m(positions: Float) -> float:
+    """Return the rms distance of positions (K, 3) from their mean."""
+    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))

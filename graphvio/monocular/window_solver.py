@@ -165,8 +165,8 @@ class WindowSolver:
         off = far_off(structure, errors2, MAX_ERROR2, MAX_OFF)
         seen = np.isin(ids, window.views[-1].landmark)
         is_tracking = int((seen & ~off).sum()) >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
-        dropped = window.names.tracks_of(ids[off])
-        window.names.end(ids[off])
+        dropped = window.landmark_ids.tracks_of(ids[off])
+        window.landmark_ids.end(ids[off])
         window.views = [views.without(ids[off]) for views in window.views]
         if is_tracking:
             _leave_out_mismatches(window, structure, ids, errors2)
@@ -174,7 +174,7 @@ class WindowSolver:
 
     def _finish_keyframe(self, window: KeyframeWindow, adjusted: Adjusted) -> None:
         """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
-        window.names.note_keyframe()
+        window.landmark_ids.note_keyframe()
         if len(adjusted.equations.errors2):
             wanted = min(pixel_noise(adjusted.equations.errors2, self._sigma_px), _MAX_SIGMA_PX)
             self._sigma_px += _NOISE_GAIN * (wanted - self._sigma_px)
@@ -192,7 +192,7 @@ class WindowSolver:
             self._hand_over(measured.structure, states, places[leaving])
         walk = self.calibration.walk((states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9)
         window.prior = without_first(measured, states, places[leaving], window.prior, walk)
-        window.names.end(window.views[0].landmark)
+        window.landmark_ids.end(window.views[0].landmark)
         window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
         del window.stationary[0]
         self._final.append((int(states.stamps_ns[0]), states.poses[0]))
@@ -240,4 +240,4 @@ def _leave_out_mismatches(window: KeyframeWindow, structure: Structure, ids: Int
     landmarks = ids[np.searchsorted(structure.rows, rows, side="right") - 1]
     newest = window.views[-1]
     window.views[-1] = kept = newest.without_adopted(landmarks, structure.camera[rows])
-    window.names.end(np.setdiff1d(newest.landmark, kept.landmark))
+    window.landmark_ids.end(np.setdiff1d(newest.landmark, kept.landmark))
