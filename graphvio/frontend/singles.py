@@ -106,14 +106,14 @@ class SinglesFrontend(TrackingFrontend):
 
         Those that another camera's track is a part of are found by that one.
         """
-        views = {j: self._trackers[j].view for j in frames}
+        images = {j: self._trackers[j].tracked_image for j in frames}
         of_others = {j: np.zeros(len(frames[j].ids), dtype=bool) for j in frames}
         if not searches:
             of_others = {j: self._handover.is_followed(j, frames) for j in frames}
 
         def find(j: int) -> CameraTracks:
             chosen = ~of_others[j] if wanted is None else wanted[j]
-            self._overlaps.find(j, views, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
+            self._overlaps.find(j, images, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
             matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
             return CameraTracks(frames[j].ids, frames[j].left_rays, matches, handed_over)
 

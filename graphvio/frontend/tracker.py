@@ -156,7 +156,7 @@ class GroupTracker:
         return self._last, which[new.ids - first_id]
 
     @property
-    def view(self) -> TrackedImage:
+    def tracked_image(self) -> TrackedImage:
         """The newest left image, and what is tracked in it."""
         return TrackedImage(self._last, self._left_pyramid, self._allowed, self._min_gradient)
 
