@@ -32,7 +32,7 @@ from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import inverse_depths_around
 from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
-from graphvio.frontend.selection import best_pair_motion, joint_motion_known_depths
+from graphvio.frontend.selection import best_pair_motion, searched_and_refined
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.tracker import GroupTracker
 from graphvio.frontend.tracks import common_rows
@@ -144,7 +144,7 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     if rig.singles:
         history = MotionHistory()
         history.restart(frame.stamp_ns)
-        FirstSights().locate(frame.ids, frame.left, history, np.eye(4), 1.0, 1.0)
+        FirstSights().locate(frame.ids, frame.left_rays, history, np.eye(4), 1.0, 1.0)
     if not rig.pairs:
         _track_singles(rig, config, rng)
     if any(camera.line_time_us for camera in rig.cameras):
@@ -177,10 +177,10 @@ def _warm_up_motion(rig: Rig, config: Config) -> None:
         np.ascontiguousarray(points[:, :2]),
         np.ones(_POINTS, dtype=bool),
     )
-    for solve in (joint_motion_known_depths, best_pair_motion):
+    for solve in (searched_and_refined, best_pair_motion):
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
     arrays = RigArrays.of(rig)
-    motion = joint_motion_known_depths(arrays, observations, np.eye(4), config.motion, rng)
+    motion = searched_and_refined(arrays, observations, np.eye(4), config.motion, rng)
     warm_up_extrinsic_monitor(motion)
     by_depth_errors(arrays, observations, motion.inlier, np.eye(4))
     if rig.pairs and rig.singles:

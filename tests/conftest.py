@@ -34,7 +34,7 @@ _LONGEST = (
     "ros2_publisher", "slam_fuzz", "cli_warming", "image_noise", "ros2_package", "sources_units",
     "cli_calibrate_trajectories", "simulation_calibration_error", "site", "calibration_imu", "real_imu",
     "calibration_motions", "live_oak", "cli_program", "frontend_tracker", "ekf_graph", "imu_noise", "frontend_motion",
-    "frontend_extrinsic_monitor", "cli_compare", "evaluation", "spike_guard", "stamp_jitter", "viewer_web",
+    "frontend_extrinsic_monitor", "cli_compare", "evaluation", "spike_filter", "stamp_jitter", "viewer_web",
     "lens_models", "calibration_curves",
 )  # fmt: skip
 _RANKS = {f"test_{name}": rank for rank, name in enumerate(_LONGEST)}

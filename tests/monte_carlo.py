@@ -19,7 +19,7 @@ from graphvio.backend.states import InitialUncertainty, RigState
 from graphvio.config.stages import MotionConfig, SmootherConfig
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import joint_motion_known_depths
+from graphvio.frontend.selection import searched_and_refined
 from graphvio.frontend.stereo import triangulate
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
@@ -256,7 +256,7 @@ def observe(tracks: Tracks, reference: Seen, current: Seen, has_right: bool = Tr
 def solve(observations: Observations, true_cur_T_ref: Float, config: MotionConfig, rng: np.random.Generator) -> Refined:
     """The joint motion, from a prediction that is a little off."""
     off = se3_exp(_PREDICTION_SIGMA * rng.standard_normal(6))
-    return joint_motion_known_depths(
+    return searched_and_refined(
         arrays_of_walks(), observations, np.ascontiguousarray(off @ true_cur_T_ref), config, rng
     )
 

@@ -21,7 +21,7 @@ from graphvio.self_calibration.parameters import (
     STEREO,
     depths_of_pair,
     moved_cameras,
-    n_of_cameras,
+    n_camera_parameters,
 )
 
 RIG = two_pair_rig()
@@ -93,7 +93,7 @@ def other_depths(difference: Float, pair: int, inverse_depth: float) -> float:
 @pytest.mark.parametrize("pair", [0, 1])
 @pytest.mark.parametrize("parameter", CENTRE_AND_STEREO)
 def test_depths_of_a_pair_change_with_its_calibration(pair: int, parameter: int) -> None:
-    difference = np.zeros(n_of_cameras(RIG))
+    difference = np.zeros(n_camera_parameters(RIG))
     difference[PAIR * pair + parameter] = step = 1e-3 if parameter < STEREO else 1e-6
     offset, share = depths_of_pair(RIG, pair) @ difference / step
     far = other_depths(difference, pair, 0.0) / step

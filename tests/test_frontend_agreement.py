@@ -14,11 +14,12 @@ from graphvio.frontend.agreement import Agreement, MotionHypothesis, _consensus_
 from graphvio.frontend.frozen import Frozen
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.pair_reports import pair_reports
-from graphvio.frontend.quality import StereoShare, graded, graded_hypothesis, stereo_share
+from graphvio.frontend.quality import StereoShare, checked_hypothesis, motion_with_quality, stereo_share
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import joint_motion_known_depths
+from graphvio.frontend.selection import searched_and_refined
+from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.frontend.tracks import TrackedFrame
-from graphvio.frontend.visual import Seen, VisualFrontend
+from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion
 
@@ -39,7 +40,7 @@ def agreement_of(
     uncertain: Mapping[int, Float] | None = None,
 ) -> Agreement:
     rng = np.random.default_rng(seed)
-    joint = joint_motion_known_depths(arrays, seen, STILL, CONFIG, rng)
+    joint = searched_and_refined(arrays, seen, STILL, CONFIG, rng)
     return agree(arrays, seen, joint, CONFIG, rng, uncertain or {}, in_doubt)
 
 
@@ -123,7 +124,7 @@ def test_doubt_lasts_a_second() -> None:
     sides = {}
     for milliseconds, seen in ((0, slightly), (500, plainly), (1450, slightly), (1550, slightly)):
         frames = {0: TrackedFrame.empty()}
-        tracked = Seen(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
+        tracked = TrackedFrameset(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
         agreement, _ = frontend._estimate_motion(tracked, lambda _: STILL)
         assert agreement is not None
         sides[milliseconds] = len(agreement.hypotheses)
@@ -279,18 +280,20 @@ def measured(cur_T_ref: Float, inliers: int, sigma: float = 1e-4) -> RelativeMot
     return RelativeMotion(0, 50_000_000, se3_inverse(cur_T_ref), covariance, 0.3 * covariance, inliers)
 
 
-def graded_motion(
+def judged(
     motions: Sequence[RelativeMotion],
     max_distance: float,
     frozen_since_ns: int | None,
     stereo: StereoShare,
     noise: float = 0.5,
 ) -> tuple[RelativeMotion, Quality, str]:
-    return graded([graded_hypothesis(motion, frozen_since_ns, stereo, noise) for motion in motions], max_distance)
+    return motion_with_quality(
+        [checked_hypothesis(motion, frozen_since_ns, stereo, noise) for motion in motions], max_distance
+    )
 
 
 def test_a_good_motion_is_left_as_it_is() -> None:
-    motion, quality, reason = graded_motion([measured(TRUTH, 200)], 5.0, None, CONFIRMED)
+    motion, quality, reason = judged([measured(TRUTH, 200)], 5.0, None, CONFIRMED)
     assert quality is Quality.GOOD
     assert reason == ""
     assert np.array_equal(motion.covariance, measured(TRUTH, 200).covariance)
@@ -298,7 +301,7 @@ def test_a_good_motion_is_left_as_it_is() -> None:
 
 def test_the_covariance_covers_the_rival() -> None:
     """Whichever of the two motions is right, its turn and its shift are each within about a sigma."""
-    motion, quality, reason = graded_motion([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None, CONFIRMED)
+    motion, quality, reason = judged([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None, CONFIRMED)
     assert quality is Quality.WEAK
     assert "two motions are seen" in reason
     for right in (TRUTH, DOOR):
@@ -309,31 +312,30 @@ def test_the_covariance_covers_the_rival() -> None:
         np.ascontiguousarray(transform([0.02, -0.03, 0.06], [0.02, -0.06, 0.05]) @ motion.reference_T_current)
     )
     assert error @ np.linalg.solve(motion.covariance, error) < 6.0
-    few = graded_motion([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None, CONFIRMED)
+    few = judged([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None, CONFIRMED)
     assert few[1] is Quality.GOOD  # somebody far away
 
 
 def test_few_points_are_believed_less_and_less() -> None:
     sigmas = [
-        np.sqrt(np.trace(graded_motion([measured(TRUTH, n)], 0.0, None, CONFIRMED)[0].covariance))
-        for n in (40, 29, 20, 12)
+        np.sqrt(np.trace(judged([measured(TRUTH, n)], 0.0, None, CONFIRMED)[0].covariance)) for n in (40, 29, 20, 12)
     ]
     assert sigmas == sorted(sigmas)
     assert sigmas[0] < 1e-3
     assert sigmas[-1] > 0.03  # as far as a person walks in the time
-    assert graded_motion([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
+    assert judged([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
 
 
 @pytest.mark.parametrize(("noise", "factor"), [(0.2, 1.0), (1.0, 1.0), (1.5, 2.25), (2.5, 6.25)])
 def test_errors_beyond_the_modelled_noise_count_twice(noise: float, factor: float) -> None:
-    motion, quality, reason = graded_motion([measured(TRUTH, 200)], 0.0, None, CONFIRMED, noise)
+    motion, quality, reason = judged([measured(TRUTH, 200)], 0.0, None, CONFIRMED, noise)
     np.testing.assert_allclose(motion.covariance, factor * measured(TRUTH, 200).covariance)
     assert quality is (Quality.WEAK if noise > 2.0 else Quality.GOOD)
     assert ("2.5 times worse" in reason) == (noise > 2.0)
 
 
 def test_images_that_all_repeat_say_nothing_for_sure() -> None:
-    motion, quality, reason = graded_motion([measured(STILL, 300)], 0.0, -950_000_000, CONFIRMED)
+    motion, quality, reason = judged([measured(STILL, 300)], 0.0, -950_000_000, CONFIRMED)
     assert quality is Quality.WEAK
     assert "repeats" in reason
     assert np.sqrt(motion.covariance[3, 3]) == pytest.approx(1.0, rel=0.01)  # a metre in a second
@@ -347,20 +349,18 @@ def test_weakest_sigmas_are_those_of_the_weakest_directions() -> None:
     assert replace(measured(TRUTH, 50), covariance=covariance).weakest_sigmas == pytest.approx((2e-3, 0.03))
 
 
-def test_graded_distance_and_weak_directions_enlarge_the_covariance() -> None:
+def test_distance_and_weak_directions_enlarge_the_covariance() -> None:
     base = np.trace(measured(TRUTH, 200).covariance)
-    assert np.trace(graded_motion([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(
-        3.0 * base
-    )
+    assert np.trace(judged([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)
     weak = replace(measured(TRUTH, 200), covariance=np.diag([1e-8] * 5 + [0.01]))
-    assert graded_motion([weak], 0.0, None, CONFIRMED)[1] is Quality.WEAK
+    assert judged([weak], 0.0, None, CONFIRMED)[1] is Quality.WEAK
     random = random_transform(np.random.default_rng(0), 0.01, 0.01)
-    assert graded_motion([measured(random, 200)], 0.0, None, CONFIRMED)[1] is Quality.GOOD
+    assert judged([measured(random, 200)], 0.0, None, CONFIRMED)[1] is Quality.GOOD
 
 
 def test_what_the_right_images_do_not_confirm_may_be_off_by_the_baseline() -> None:
     """As it is when the cables of left and right are swapped while the rig runs."""
-    motion, quality, reason = graded_motion([measured(TRUTH, 200)], 0.0, None, StereoShare(0.1, 0.12))
+    motion, quality, reason = judged([measured(TRUTH, 200)], 0.0, None, StereoShare(0.1, 0.12))
     assert quality is Quality.WEAK
     assert reason == "only 10 % of the corners are found in the right images"
     sigmas = np.sqrt(np.diag(motion.covariance))
@@ -379,4 +379,4 @@ def test_the_share_that_stereo_confirms_is_that_of_all_corners() -> None:
     assert stereo_share({1: reference[1]}, current, [0.1, 0.2]).share == pytest.approx(0.08)
     assert stereo_share({**reference, 1: frame(0, 0)}, current, [0.1, 0.2]).share == pytest.approx(100 * 0.6 / 150)
     assert stereo_share({0: frame(0, 0)}, {0: frame(0, 0)}, [0.1, 0.2]).share == 0.0
-    assert graded_motion([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD
+    assert judged([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD

@@ -50,8 +50,8 @@ def tracks() -> TrackedFrame:
         ids=10 + 2 * np.arange(n),
         ages=np.zeros(n, dtype=np.int64),
         pixels=pixels,
-        left=rays,
-        right=rays,
+        left_rays=rays,
+        right_rays=rays,
         points=np.column_stack([rays, rays @ WALL[:2] + WALL[2]]),
         covariances=np.zeros((n, 3, 3)),
         slopes=np.tile(BASELINE_M * WALL[:2], (n, 1)),
@@ -61,7 +61,7 @@ def tracks() -> TrackedFrame:
 
 
 def seen_after(frame: TrackedFrame, left_T_left_keyframe: Float) -> Float:
-    rays = np.column_stack([frame.left, np.ones(len(frame.ids))])
+    rays = np.column_stack([frame.left_rays, np.ones(len(frame.ids))])
     points = rays / (rays @ WALL)[:, None] @ left_T_left_keyframe[:3, :3].T + left_T_left_keyframe[:3, 3]
     return np.asarray(FOCAL * points[:, :2] / points[:, 2:] + CENTRE)
 

@@ -16,7 +16,7 @@ from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.paper_method import PairPoints, cost
 from graphvio.frontend.ransac import hypothesise, preempt, search
 from graphvio.frontend.refinement import explained, refine
-from graphvio.frontend.selection import best_pair_motion, global_cost, joint_motion_known_depths
+from graphvio.frontend.selection import best_pair_motion, global_cost, searched_and_refined
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.rig import Rig
 
@@ -147,7 +147,7 @@ def test_refine_finds_a_minimum_of_the_cost() -> None:
     seen = seen_points(RIG, TRUTH, 25, seed(6), sigma_px=0.3)
     seen = seen._replace(has_right=seed(7).random(50) < 0.8)
     everyone = np.ones(50, dtype=bool)  # known, so that both pairs count for the same
-    refined = refine(ARRAYS, seen, TRUTH, CONFIG, known=everyone)
+    refined = refine(ARRAYS, seen, TRUTH, CONFIG, known_inlier=everyone)
     lowest = eliminated_cost(seen, refined.cur_T_ref, CONFIG)
     steps = 0.3 * np.sqrt(np.diag(refined.covariance))
     for axis in range(6):
@@ -173,7 +173,7 @@ def test_refine_without_noise_recovers_the_truth(pairs: list[int]) -> None:
 def test_motion_among_outliers_recovers_the_truth(number: int) -> None:
     seen = seen_points(RIG, TRUTH, 80, seed(20 + number), sigma_px=0.3, outlier_share=0.3)
     far_away = transform([0.3, 0.2, -0.2], [0.5, 0.5, 0.5])  # a prediction of no use
-    for solve in (joint_motion_known_depths, best_pair_motion):
+    for solve in (searched_and_refined, best_pair_motion):
         refined = solve(ARRAYS, seen, far_away, CONFIG, seed())
         error = se3_log(refined.cur_T_ref @ np.linalg.inv(TRUTH))
         assert error @ np.linalg.solve(refined.covariance, error) < chi2.ppf(0.9999, 6)
@@ -314,7 +314,7 @@ def noisy(rig: Rig = RIG) -> Observations:
 def test_motion_of_one_pair_is_that_of_the_single_pair_algorithm() -> None:
     rig = RIG.with_pairs([1])
     arrays, seen = RigArrays.of(rig), noisy(rig)
-    joint = joint_motion_known_depths(arrays, seen, STILL, CONFIG, seed())
+    joint = searched_and_refined(arrays, seen, STILL, CONFIG, seed())
     best = best_pair_motion(arrays, seen, STILL, CONFIG, seed())
     assert np.array_equal(joint.cur_T_ref, best.cur_T_ref)
     assert np.array_equal(joint.covariance, best.covariance)
@@ -326,8 +326,8 @@ def test_motion_of_one_pair_is_that_of_the_single_pair_algorithm() -> None:
 
 def test_joint_motion_with_a_pair_without_points_is_unchanged() -> None:
     alone = noisy(RIG.with_pairs([0]))
-    one = joint_motion_known_depths(RigArrays.of(RIG.with_pairs([0])), alone, STILL, CONFIG, seed())
-    two = joint_motion_known_depths(ARRAYS, alone, STILL, CONFIG, seed())
+    one = searched_and_refined(RigArrays.of(RIG.with_pairs([0])), alone, STILL, CONFIG, seed())
+    two = searched_and_refined(ARRAYS, alone, STILL, CONFIG, seed())
     np.testing.assert_allclose(one.cur_T_ref, two.cur_T_ref, rtol=0, atol=1e-12)
     np.testing.assert_allclose(one.covariance, two.covariance, rtol=1e-9)
 
@@ -350,8 +350,8 @@ def test_joint_motion_with_swapped_pairs_is_unchanged(number: int) -> None:
     seen = seen_points(RIG, TRUTH, 60, seed(60 + number), sigma_px=0.3, outlier_share=0.2)
     order = np.concatenate([np.flatnonzero(seen.pair == 1), np.flatnonzero(seen.pair == 0)])
     swapped = take(seen, order)._replace(pair=1 - seen.pair[order])
-    first = joint_motion_known_depths(ARRAYS, seen, STILL, CONFIG, seed(number))
-    second = joint_motion_known_depths(RigArrays.of(RIG.with_pairs([1, 0])), swapped, STILL, CONFIG, seed(number))
+    first = searched_and_refined(ARRAYS, seen, STILL, CONFIG, seed(number))
+    second = searched_and_refined(RigArrays.of(RIG.with_pairs([1, 0])), swapped, STILL, CONFIG, seed(number))
     sigmas = np.sqrt(np.diag(first.covariance))
     assert np.abs(se3_log(second.cur_T_ref @ np.linalg.inv(first.cur_T_ref)) / sigmas).max() < 0.01
     scale = np.outer(sigmas, sigmas)
@@ -359,7 +359,7 @@ def test_joint_motion_with_swapped_pairs_is_unchanged(number: int) -> None:
     assert np.array_equal(second.inlier, first.inlier[order])
 
 
-@pytest.mark.parametrize("solve", [joint_motion_known_depths, best_pair_motion])
+@pytest.mark.parametrize("solve", [searched_and_refined, best_pair_motion])
 def test_motion_of_the_same_seed_is_the_same(solve: Callable[..., object]) -> None:
     seen = noisy()
     first, again = (solve(ARRAYS, seen, STILL, CONFIG, seed(5)) for _ in range(2))
@@ -377,13 +377,13 @@ def test_best_pair_motion_is_of_the_pair_with_sound_points() -> None:
         left[wrong], right[wrong] = places
         broken = sound._replace(left=left, right=right)
         best = best_pair_motion(ARRAYS, broken, STILL, CONFIG, seed())
-        alone = joint_motion_known_depths(ARRAYS, broken.of_pair(1 - pair), STILL, CONFIG, seed())
+        alone = searched_and_refined(ARRAYS, broken.of_pair(1 - pair), STILL, CONFIG, seed())
         assert np.abs(best.cur_T_ref - TRUTH).max() < 5e-3
         assert np.abs(best.cur_T_ref - alone.cur_T_ref).max() < 1e-3
         assert len(best.inlier) == 120
         assert best.inlier[~wrong].mean() > 0.8
         assert best.inlier[wrong].mean() < 0.1
-        joint = joint_motion_known_depths(ARRAYS, broken, STILL, CONFIG, seed())
+        joint = searched_and_refined(ARRAYS, broken, STILL, CONFIG, seed())
         assert np.abs(joint.cur_T_ref - TRUTH).max() < 5e-3
 
 
@@ -391,7 +391,7 @@ def test_joint_motion_is_better_than_the_best_pairs() -> None:
     errors: dict[str, list[float]] = {"joint": [], "best": []}
     for number in range(40):
         seen = seen_points(RIG, TRUTH, 40, seed(500 + number), sigma_px=0.3)
-        for name, solve in (("joint", joint_motion_known_depths), ("best", best_pair_motion)):
+        for name, solve in (("joint", searched_and_refined), ("best", best_pair_motion)):
             refined = solve(ARRAYS, seen, TRUTH, replace(CONFIG, hypotheses=20), seed())
             errors[name].append(float(np.linalg.norm((se3_inverse(TRUTH) @ refined.cur_T_ref)[:3, 3])))
     assert np.mean(errors["joint"]) < 0.7 * np.mean(errors["best"])

@@ -195,7 +195,7 @@ def test_refine_per_image_leaves_out_points_that_are_known_to_be_outliers() -> N
     arrays, seen = RigArrays.of(rig), scene(rig, 50)
     known = np.arange(len(seen.pair)) % 3 > 0
     part, whole = (
-        refine(arrays, of, TRUTH, PER_IMAGE, known=rows)
+        refine(arrays, of, TRUTH, PER_IMAGE, known_inlier=rows)
         for of, rows in ((seen.of_rows(known), np.ones(int(known.sum()), dtype=bool)), (seen, known))
     )
     np.testing.assert_allclose(whole.cur_T_ref, part.cur_T_ref, atol=1e-9)

@@ -16,7 +16,7 @@ from graphvio.evaluation import evaluate
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
-from graphvio.self_calibration.parameters import STEREO, moved_cameras, n_of_cameras
+from graphvio.self_calibration.parameters import STEREO, moved_cameras, n_camera_parameters
 from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -149,7 +149,7 @@ def test_imu_that_is_right_is_not_left_out(walk: Path) -> None:
 def test_imu_is_not_left_out_where_the_calibration_of_a_pair_is_wrong(long_room_walk: Path, pair: int) -> None:
     """Left to right is off by 0.15 degrees: until that is known, motions by the pair are too long by a tenth."""
     rig = open_source(long_room_walk).rig.with_pairs([pair])
-    difference = np.zeros(n_of_cameras(rig))
+    difference = np.zeros(n_camera_parameters(rig))
     difference[STEREO + 1] = np.deg2rad(0.15)
     walked = Walked(open_source(long_room_walk, moved_cameras(rig, difference)), lambda sample, _: sample)
     assert not walked.events & Counter([LEFT_OUT, EventKind.VISION_GATED, EventKind.GATE_RESET])

@@ -38,7 +38,7 @@ from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.marginalisation import without_first
 from graphvio.monocular.reprojection import Cameras
-from graphvio.monocular.sightings import LandmarkNames, Landmarks
+from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
 from graphvio.rig import Camera, Rig, SingleCamera
@@ -293,12 +293,12 @@ def seen(
 
 
 def test_tracks_of_several_cameras_that_follow_one_point_are_one_landmark_with_one_view_by_each() -> None:
-    names = LandmarkNames(2, 10)
-    first = names.join({0: seen([3, 4]), 1: seen([0])})
+    landmark_ids = LandmarkIds(2, 10)
+    first = landmark_ids.join({0: seen([3, 4]), 1: seen([0])})
     assert len(set(first.landmark.tolist())) == 3
     point = first.landmark[first.ids == 4][0]
     adopted = HandedOverTracks(np.array([1]), np.array([0]), np.array([4]))  # the second camera's second track
-    both = names.join(
+    both = landmark_ids.join(
         {
             0: seen([3, 4], elsewhere=(CrossCameraMatches(1, np.array([1]), np.array([[-1.0, -1.0]])),)),
             1: seen([0, 7], adopted, (CrossCameraMatches(0, np.array([1]), np.array([[-2.0, -2.0]])),)),
@@ -307,22 +307,23 @@ def test_tracks_of_several_cameras_that_follow_one_point_are_one_landmark_with_o
     of_point = both.landmark == point
     assert both.camera[of_point].tolist() == [0, 1]
     assert both.rays[of_point, 0].tolist() == [4.0, -1.0]  # by the track that began it
-    assert {camera: ids.tolist() for camera, ids in names.tracks_of(np.array([point])).items()} == {0: [4], 1: [7]}
-    alone = names.join({0: seen([3]), 1: seen([0, 7], adopted)})
+    tracks = landmark_ids.tracks_of(np.array([point]))
+    assert {camera: ids.tolist() for camera, ids in tracks.items()} == {0: [4], 1: [7]}
+    alone = landmark_ids.join({0: seen([3]), 1: seen([0, 7], adopted)})
     of_point = alone.landmark == point
     assert alone.camera[of_point].tolist() == [1]
     assert alone.rays[of_point, 0].tolist() == [7.0]
-    names.end(np.array([point]))
-    after = names.join({0: seen([3]), 1: seen([0, 7], adopted)})
+    landmark_ids.end(np.array([point]))
+    after = landmark_ids.join({0: seen([3]), 1: seen([0, 7], adopted)})
     assert after.landmark[after.ids == 7][0] not in first.landmark
     assert set(after.landmark[after.ids != 7].tolist()) < set(first.landmark.tolist())
 
 
 def test_landmarks_of_a_camera_without_an_image_are_kept_and_others_forgotten() -> None:
-    names = LandmarkNames(2, 10)
-    first = names.join({0: seen([1]), 1: seen([2])})
-    names.join({0: seen([5])})
-    last = names.join({0: seen([1, 5]), 1: seen([2])})
+    landmark_ids = LandmarkIds(2, 10)
+    first = landmark_ids.join({0: seen([1]), 1: seen([2])})
+    landmark_ids.join({0: seen([5])})
+    last = landmark_ids.join({0: seen([1, 5]), 1: seen([2])})
     assert last.landmark[last.ids == 2].tolist() == first.landmark[first.ids == 2].tolist()
     assert last.landmark[last.ids == 1][0] not in first.landmark
 
@@ -363,8 +364,8 @@ def problem(
         states = states.moved(1e-3 * rng.normal(size=9 * n_keyframes + 9))
     cameras = Cameras.of(rig)
     tracks, landmarks = Tracks(rig, flight, shares), Landmarks()
-    names = LandmarkNames(len(rig.singles), n_keyframes)
-    views = [names.join(tracks.camera_tracks(t, 0.3)) for t in times]
+    landmark_ids = LandmarkIds(len(rig.singles), n_keyframes)
+    views = [landmark_ids.join(tracks.camera_tracks(t, 0.3)) for t in times]
     structure, places, _ = landmarks.structure(views, states.poses, cameras)
     places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
     measured = Measurements(cameras, structure, PIXEL_SIGMA_PX, samples, np.zeros(0, dtype=np.int64))
@@ -376,7 +377,7 @@ def at_best(measured: Measurements, states: States, landmarks: Float) -> tuple[F
     cameras = states.cameras(measured.cameras)
     for _ in range(20):
         landmarks = located(states.poses, cameras, landmarks, measured.structure, 2.0, True)
-    eliminated = Eliminated.empty(measured.structure, states.n_cameras)
+    eliminated = Eliminated.empty(measured.structure, states.n_camera_parameters)
     return visual_equations(states.poses, cameras, landmarks, measured.structure, 2.0, 1e4, eliminated)[:3]
 
 
@@ -390,8 +391,10 @@ def moved_by(states: States, unknown: int, step: float) -> States:
 
 def calibration_unknowns(states: States) -> list[int]:
     """Return a focal length, a principal point, a coefficient and the place of the last camera, as unknowns."""
-    first = 6 * len(states.poses) + states.n_cameras - SINGLE
-    return [first, first + 3, first + INTRINSICS, *range(first + PLACE, first + SINGLE)] if states.n_cameras else []
+    if not states.n_camera_parameters:
+        return []
+    first = 6 * len(states.poses) + states.n_camera_parameters - SINGLE
+    return [first, first + 3, first + INTRINSICS, *range(first + PLACE, first + SINGLE)]
 
 
 @pytest.mark.parametrize("calibrates", [False, True])
@@ -401,7 +404,7 @@ def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_
 ) -> None:
     measured, states, landmarks, _ = problem(4, shares=shares, calibrates=calibrates)
     _, gradient, _ = at_best(measured, states, landmarks)
-    of_pixels = 6 * 4 + states.n_cameras - SINGLE + np.arange(INTRINSICS)
+    of_pixels = 6 * 4 + states.n_camera_parameters - SINGLE + np.arange(INTRINSICS)
     for unknown in [*range(24), *calibration_unknowns(states)]:
         step = 1e-3 if unknown in of_pixels else 1e-5
         after, before = (at_best(measured, moved_by(states, unknown, s), landmarks)[2] for s in (step, -step))

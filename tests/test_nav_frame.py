@@ -87,7 +87,8 @@ def test_consider_covariance_after_a_correction_of_the_pose_has_what_is_left() -
     consider = ConsiderCovariance(6)
     first, newest = Keyframe(0, np.eye(4), {}), Keyframe(1, POSE, {})
     consider.extend([first, newest], np.array([np.zeros((6, 6)), gain]))
-    consider.learn(change, np.zeros((6, 6)))  # the calibration is known now, and the pose as wrong as before
+    # The calibration is known now, and the pose as wrong as before.
+    consider.set_calibration_in_force(change, np.zeros((6, 6)))
     consider.correct(gain @ change)
     np.testing.assert_allclose(consider.at(POSE), 0.0, atol=1e-30)
     consider.correct(np.array([1e-6, 0.0, 0.0, 0.0, 0.0, 0.0]))  # so small that there is no term of second order

@@ -85,7 +85,7 @@ def surround_walk() -> SurroundWalk:
             depth, world_T_cam = simulator.view(k, j).depth, poses[k] @ cameras[j].body_T_cam
             rows, begun_by, begun_as = tracks.handed_over
             columns, lines = np.rint(frames[j].pixels).astype(int).T
-            points = np.column_stack([frames[j].left, np.ones(len(columns))]) * depth[lines, columns][:, None]
+            points = np.column_stack([frames[j].left_rays, np.ones(len(columns))]) * depth[lines, columns][:, None]
             points = points @ world_T_cam[:3, :3].T + world_T_cam[:3, 3]
             own = np.setdiff1d(np.arange(len(columns)), rows)
             in_world |= {(j, int(tracks.ids[i])): points[i] for i in own}

@@ -36,7 +36,7 @@ def test_consider_covariance_of_motions_with_one_calibration_adds_their_errors_a
     by_cameras = np.concatenate([np.zeros((1, 6, N)), rng.standard_normal((5, 6, N))])
     whole, grown = ConsiderCovariance(N), ConsiderCovariance(N)
     for consider, sizes in ((whole, (6,)), (grown, (1, 3, 4, 6))):
-        consider.learn(np.zeros(N), known)
+        consider.set_calibration_in_force(np.zeros(N), known)
         for size in sizes:
             consider.extend(keyframes[:size], by_cameras[:size])
     expected = by_cameras[-1] @ known @ by_cameras[-1].T
@@ -58,9 +58,9 @@ def test_consider_covariance_with_a_better_calibration_is_that_of_the_errors() -
         true = rng.multivariate_normal(np.zeros(N), before)
         learnt = gain @ (measured @ true + np.sqrt(0.1) * rng.standard_normal(2))
         consider = ConsiderCovariance(N)
-        consider.learn(np.zeros(N), before)
+        consider.set_calibration_in_force(np.zeros(N), before)
         consider.extend([start, first], np.array([np.zeros((6, N)), of_first]))
-        consider.learn(learnt, after)
+        consider.set_calibration_in_force(learnt, after)
         consider.extend([first, second], np.array([np.zeros((6, N)), of_second]))
         error = carried @ of_first @ true + of_second @ (true - learnt)
         added = consider.at(second.odom_T_body)
@@ -88,7 +88,7 @@ def test_consider_covariance_of_large_turns_has_their_terms_of_second_order() ->
 
 def test_consider_covariance_at_a_later_pose_grows_with_the_lever_arm() -> None:
     consider = ConsiderCovariance(N)
-    consider.learn(np.zeros(N), np.eye(N))
+    consider.set_calibration_in_force(np.zeros(N), np.eye(N))
     by_cameras = np.zeros((2, 6, N))
     by_cameras[1, 2, 0] = 0.01  # a turn about z
     consider.extend([Keyframe(0, np.eye(4), {}), Keyframe(1, np.eye(4), {})], by_cameras)
@@ -101,12 +101,12 @@ def test_consider_covariance_at_a_later_pose_grows_with_the_lever_arm() -> None:
 
 def test_consider_covariance_after_a_knock_keeps_what_there_is_and_no_correlation() -> None:
     consider = ConsiderCovariance(N)
-    consider.learn(np.zeros(N), np.eye(N))
+    consider.set_calibration_in_force(np.zeros(N), np.eye(N))
     frames = [keyframe(0, 0), keyframe(1, 1)]
     consider.extend(frames, np.array([np.zeros((6, N)), np.ones((6, N))]))
     before = consider.at(frames[1].odom_T_body)
     consider.forget()
-    consider.learn(np.ones(N), 100.0 * np.eye(N))
+    consider.set_calibration_in_force(np.ones(N), 100.0 * np.eye(N))
     np.testing.assert_allclose(consider.at(frames[1].odom_T_body), before)
 
 

@@ -8,7 +8,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_exp, so3_log
 from graphvio.rig import Rig
 from graphvio.self_calibration.online import SelfCalibration
-from graphvio.self_calibration.parameters import PAIR, SINGLE, moved_cameras, n_of_cameras, parameter_names
+from graphvio.self_calibration.parameters import PAIR, SINGLE, moved_cameras, n_camera_parameters, parameter_names
 from graphvio.self_calibration.window import inverse_depths_of_tracks
 from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.named_rigs import stereo_and_back
@@ -73,7 +73,7 @@ def test_inverse_depths_of_tracks_are_those_of_points_seen_from_known_places() -
 def test_parameters_of_pairs_and_single_cameras_are_in_one_vector() -> None:
     rig = stereo_and_back().without_imu()
     names = parameter_names(rig)
-    assert len(names) == n_of_cameras(rig) == PAIR + SINGLE
+    assert len(names) == n_camera_parameters(rig) == PAIR + SINGLE
     difference = np.zeros(len(names))
     difference[names.index("cam2.cx_px")], difference[names.index("cam2.body_T_cam.ty")] = 0.7, 0.02
     moved = moved_cameras(rig, difference)

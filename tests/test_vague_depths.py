@@ -12,7 +12,7 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import joint_motion, joint_motion_known_depths
+from graphvio.frontend.selection import joint_motion, searched_and_refined
 from graphvio.frontend.stereo import triangulate
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.simulation.named_rigs import stereo_and_back
@@ -75,7 +75,7 @@ def test_motion_with_vague_depths_is_as_wrong_as_its_covariance_says(name: str) 
         rng = np.random.default_rng(seed)
         observations = observed(motion, rng)
         found, _ = joint_motion(arrays, observations, np.eye(4), CONFIG, rng)
-        alone = joint_motion_known_depths(arrays, observations.of_pair(0), np.eye(4), CONFIG, rng)
+        alone = searched_and_refined(arrays, observations.of_pair(0), np.eye(4), CONFIG, rng)
         values.append(nees(found, motion))
         sizes.append(np.linalg.det(found.covariance) / np.linalg.det(alone.covariance))
     assert 0.4 < np.mean(values) < 1.2
@@ -92,7 +92,7 @@ def test_scale_of_a_single_cameras_depths_does_not_scale_the_motion(sigma: float
         rng = np.random.default_rng([1, seed])
         observations = observed(motion, rng, scale=float(np.exp(sigma * rng.standard_normal())))
         found, _ = joint_motion(arrays, observations, np.eye(4), CONFIG, rng)
-        alone = joint_motion_known_depths(arrays, observations.of_pair(0), np.eye(4), CONFIG, rng)
+        alone = searched_and_refined(arrays, observations.of_pair(0), np.eye(4), CONFIG, rng)
         values.append(nees(found, motion))
         for k, each in enumerate((found, alone)):
             lengths[k, seed] = np.linalg.norm(each.cur_T_ref[:3, 3])

@@ -199,7 +199,7 @@ def _at_kept_pose(
 ) -> InitialState:
     # The pose defines nav from now on: its uncertainty is reported, but nothing is estimated of it.
     initial = with_free_gravity(_reinitialised(stamp_ns, state, pose_covariance, gravity_covariance))
-    return replace(initial, uncertainty=replace(initial.uncertainty, of_nav=pose_covariance))
+    return replace(initial, uncertainty=replace(initial.uncertainty, nav_covariance=pose_covariance))
 
 
 def _reinitialised(
@@ -211,9 +211,9 @@ def _reinitialised(
 ) -> InitialState:
     # Position and heading must not move when the attitude becomes known better: their uncertainty is reported, but
     # nothing is estimated of it.
-    pose, of_nav = as_origin(state.nav_T_body[:3, :3], pose_covariance)
+    pose, nav_covariance = as_origin(state.nav_T_body[:3, :3], pose_covariance)
     gravity = np.zeros((3, 3)) if gravity_covariance is None else gravity_covariance
-    uncertainty = InitialUncertainty(pose, _REINITIALISED_SPEED_SIGMA, gyro_bias_sigma, of_nav, gravity)
+    uncertainty = InitialUncertainty(pose, _REINITIALISED_SPEED_SIGMA, gyro_bias_sigma, nav_covariance, gravity)
     return InitialState(stamp_ns, state, uncertainty)
 
 

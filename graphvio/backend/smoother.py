@@ -92,7 +92,7 @@ class Smoother:
         k = self._append(stamp_ns, state)
         self._constrained_ns, self._seen_ns = stamp_ns, None
         to_nav = se3_adjoint(state.nav_T_body)
-        self._nav_covariance = to_nav @ uncertainty.of_nav @ to_nav.T
+        self._nav_covariance = to_nav @ uncertainty.nav_covariance @ to_nav.T
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
         if self.has_imu:
@@ -283,10 +283,10 @@ class Smoother:
             WindowError: if the window cannot be solved; no state leaves it.
         """
         keep = frozenset(keep)
-        followed = self._followed(keep)
-        advanced = self._advanced < _MAX_ADVANCED and self._window.advance(followed)
+        retained = self._retained(keep)
+        advanced = self._advanced < _MAX_ADVANCED and self._window.advance(retained)
         if not advanced:
-            self._window.optimize(followed)
+            self._window.optimize(retained)
         self._advanced = self._advanced + 1 if advanced else 0
         if len(self._stamps) > 1:
             step = se3_inverse(self.pose(self._stamps[-2])) @ self.pose(self._stamps[-1])
@@ -299,7 +299,7 @@ class Smoother:
         Raises:
             WindowError: if it has no unique solution.
         """
-        self._window.optimize(self._followed(frozenset()))
+        self._window.optimize(self._retained(frozenset()))
         self._advanced = 0
 
     def all_poses(self) -> list[tuple[int, Float]]:
@@ -334,7 +334,7 @@ class Smoother:
             ):
                 self._window.add(factor)
 
-    def _followed(self, keep: frozenset[int]) -> list[int]:
+    def _retained(self, keep: frozenset[int]) -> list[int]:
         """Return the variables that the next factors will be tied to, or whose covariance will be needed."""
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
         keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]

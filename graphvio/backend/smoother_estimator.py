@@ -255,7 +255,7 @@ class SmootherEstimator:
         excess = smoother.excess_acceleration(motion)
         if gate_result.accepted and excess is None:
             return self._accept(motion)
-        why = _exceedance(gate_result) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
+        why = gate_result.exceedance if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
         if visual.quality is not Quality.GOOD:
             return MeasurementUpdate(None)  # vision that contradicts itself cannot refute the prediction
@@ -301,7 +301,7 @@ class SmootherEstimator:
         if gate_result.accepted:
             self._running.add_zero_velocity()
         else:
-            self._report(self.latest_ns, EventKind.ZERO_VELOCITY_GATED, _exceedance(gate_result))
+            self._report(self.latest_ns, EventKind.ZERO_VELOCITY_GATED, gate_result.exceedance)
 
     def _reset_position(self, stamp_ns: int) -> None:
         """Reset the position's own uncertainty from time to time, see `Smoother.reset_position`."""
@@ -406,7 +406,3 @@ class SmootherEstimator:
     def _running(self) -> Smoother:
         assert self._smoother is not None, "the state is initialised"
         return self._smoother
-
-
-def _exceedance(gate_result: GateResult) -> str:
-    return f"innovation {gate_result.statistic:.1f} beyond chi-square {gate_result.threshold:.1f}"

@@ -47,8 +47,8 @@ class InitialUncertainty:
         pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
         velocity_m_s: standard deviation of each component.
         gyro_bias_rad_s: standard deviation of each component.
-        of_nav: (6, 6) additional covariance of the pose that is reported but not estimated, such as the uncertainty of
-            where an epoch begins: no later measurement can reduce it.
+        nav_covariance: (6, 6) additional covariance of the pose that is reported but not estimated, such as the
+            uncertainty of where an epoch begins: no later measurement can reduce it.
         gravity: (3, 3) covariance of gravity's direction in nav, (m/s^2)^2; zero where nav is level by definition, so
             that measurements turn the poses.
     """
@@ -56,7 +56,7 @@ class InitialUncertainty:
     pose: Float
     velocity_m_s: float
     gyro_bias_rad_s: float
-    of_nav: Float = field(default_factory=lambda: np.zeros((6, 6)))
+    nav_covariance: Float = field(default_factory=lambda: np.zeros((6, 6)))
     gravity: Float = field(default_factory=lambda: np.zeros((3, 3)))
 
 
@@ -121,10 +121,10 @@ def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
         heading and position. Correlations between the two are left out.
     """
     about_nav = nav_R_body @ covariance[:3, :3] @ nav_R_body.T
-    of_nav = np.zeros((6, 6))
-    of_nav[:3, :3] = about_nav[2, 2] * np.outer(nav_R_body[2], nav_R_body[2])
-    of_nav[3:, 3:] = covariance[3:, 3:]
-    return _origin_covariance(nav_R_body, about_nav[:2, :2]), of_nav
+    nav_covariance = np.zeros((6, 6))
+    nav_covariance[:3, :3] = about_nav[2, 2] * np.outer(nav_R_body[2], nav_R_body[2])
+    nav_covariance[3:, 3:] = covariance[3:, 3:]
+    return _origin_covariance(nav_R_body, about_nav[:2, :2]), nav_covariance
 
 
 def _origin_covariance(nav_R_body: Float, tilt: Float) -> Float:

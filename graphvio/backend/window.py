@@ -51,11 +51,11 @@ class GraphWindow:
         """Insert a factor; its variables must have values."""
         self._unknown.append(self._insert(factor))
 
-    def optimize(self, followed: Sequence[int] = ()) -> None:
+    def optimize(self, retained: Sequence[int] = ()) -> None:
         """Optimise by Gauss-Newton from the present values.
 
         Args:
-            followed: Variables whose covariance will be needed, and to which new factors will be tied: it is then
+            retained: Variables whose covariance will be needed, and to which new factors will be tied: it is then
                 found without solving the whole window again.
 
         Raises:
@@ -65,14 +65,16 @@ class GraphWindow:
         values = self.values
         try:
             for iteration in range(1, _MAX_ITERATIONS + 1):
-                step = self._solve(followed).optimize()
+                step = self._solve(retained).optimize()
                 largest = np.abs(step.vector()).max()
                 if not np.isfinite(largest):
                     raise WindowError("the window's solution is not finite")
                 is_last = largest < _CONVERGED and iteration >= self._min_iterations
                 moved = self.values.retract(step) if is_last else self._improved(step)
-                self.values = moved or self.values
-                self._marginal = self._marginal and self._marginal.at_solution()
+                if moved is not None:
+                    self.values = moved
+                if self._marginal is not None:
+                    self._marginal = self._marginal.at_solution()
                 if is_last or moved is None:
                     break
         except RuntimeError as error:
@@ -82,20 +84,20 @@ class GraphWindow:
             self.values, self._marginal = values, None
             raise
 
-    def advance(self, followed: Sequence[int]) -> bool:
-        """Update only the variables that the last solution followed, and those inserted since then.
+    def advance(self, retained: Sequence[int]) -> bool:
+        """Update only the variables that the last solution retained, and those inserted since then.
 
         It is a step of a filter whose prior is the window's exact marginal; all other variables keep their values.
 
         Args:
-            followed: As for `optimize`, some of these variables, for the next time.
+            retained: As for `optimize`, some of these variables, for the next time.
 
         Returns:
             Whether that was possible. Where it was not, or the step is too long for a linear one, nothing has changed.
         """
         if self._min_iterations > 1:
             return False
-        marginal = self._extended_marginal(followed)
+        marginal = self._extended_marginal(retained)
         step = None if marginal is None else marginal.step()
         if marginal is None or step is None or not np.abs(step).max() < _CONVERGED:
             return False
@@ -103,7 +105,7 @@ class GraphWindow:
         for key, at in marginal.columns.items():
             delta.insert(key, step[at])
         self.values = self.values.retract(delta)
-        self._take(marginal.of_last(followed).at_solution())
+        self._take(marginal.of_last(retained).at_solution())
         return True
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
@@ -216,12 +218,12 @@ class GraphWindow:
         """
         if self._marginal is None:
             return None
-        followed = self._marginal.columns.keys()
+        retained = self._marginal.columns.keys()
         touched = frozenset().union(*(self._involved[slot] for slot in self._unknown))
-        if touched & self._known_keys - followed or not followed | touched >= set(last):
+        if touched & self._known_keys - retained or not retained | touched >= set(last):
             return None
         linear = [self._graph.at(slot).linearize(self.values) for slot in self._unknown]
-        return self._marginal.extended(linear, last, self._known_dims(followed | touched))
+        return self._marginal.extended(linear, last, self._known_dims(retained | touched))
 
     def _take(self, marginal: Marginal | None) -> None:
         """Keep a marginal that includes all factors."""

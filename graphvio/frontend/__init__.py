@@ -27,5 +27,6 @@ ends. `extrinsics` has the poses of the cameras in body that are in force, and `
 between pairs. `standstill` and `frozen` look for images that do not change. `thresholds` has all numbers that these
 decisions depend on, and `pair_reports` reports what each pair contributed.
 
-`visual` is the front-end of a rig with stereo pairs as the odometry uses it, `singles` that of a rig without.
+`visual` is the front-end of a rig with stereo pairs as the odometry uses it, `singles` that of a rig without; what both
+do is in `tracking_frontend`.
 """

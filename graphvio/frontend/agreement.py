@@ -162,19 +162,17 @@ def _own_motion(
 ) -> Refined:
     seen, inlier = observations.of_pair(pair), joint.inlier[observations.pair == pair]
     if rig.is_single[pair]:
-        return _own_motion_of_single(rig, seen, inlier, joint, config)
+        return _own_motion_of_single(rig, seen, joint, config)
     share = float(inlier.mean())
     if share >= _T.min_joint_share:
-        return refine(rig, seen, joint.cur_T_ref, config, known=inlier)
+        return refine(rig, seen, joint.cur_T_ref, config, known_inlier=inlier)
     start = joint.cur_T_ref
     if share < _T.max_searched_share:
         start = search(rig, seen, start, config, rng)
     return refine(rig, seen, start, config)
 
 
-def _own_motion_of_single(
-    rig: RigArrays, seen: Observations, inlier: Bool, joint: Refined, config: MotionConfig
-) -> Refined:
+def _own_motion_of_single(rig: RigArrays, seen: Observations, joint: Refined, config: MotionConfig) -> Refined:
     """Refine the joint motion on the points of a single camera whose depth is known; of the others it says nothing."""
     known = seen.has_known_depth(config.pixel_sigma_px)
     if not known.any():

@@ -93,9 +93,11 @@ def with_free_length(
         return motion
     singles = np.unique(observations.pair[refined.inlier]).tolist()
     along = np.array([_along_translation(rig, single, refined.cur_T_ref) for single in singles])
-    of_scale = along.T @ along
+    scale_covariance = along.T @ along
     motion = replace(
-        motion, covariance=motion.covariance + of_scale, shared_covariance=motion.shared_covariance + of_scale
+        motion,
+        covariance=motion.covariance + scale_covariance,
+        shared_covariance=motion.shared_covariance + scale_covariance,
     )
     if predicted is None:
         return motion
@@ -136,11 +138,11 @@ def _with_possible_length(
 def with_scale_of_depths(rig: RigArrays, single: int, motion: Refined) -> Refined:
     """Enlarge the covariance of a single camera's own motion by what is not known of its depths' scale."""
     along = _SIGMA * _along_translation(rig, single, motion.cur_T_ref)
-    of_scale = np.outer(along, along)
+    scale_covariance = np.outer(along, along)
     return replace(
         motion,
-        covariance=motion.covariance + of_scale,
-        shared_covariance=motion.shared_covariance + of_scale,
+        covariance=motion.covariance + scale_covariance,
+        shared_covariance=motion.shared_covariance + scale_covariance,
     )
 
 

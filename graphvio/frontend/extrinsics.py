@@ -32,7 +32,7 @@ class RigExtrinsics:
     """
 
     def __init__(self, rig: Rig, config: Config) -> None:
-        monitored = range(1, 1 if config.estimates_calibration else len(rig.groups))
+        monitored = [] if config.estimates_calibration else range(1, len(rig.groups))
         self._monitors = {j: ExtrinsicMonitor() for j in monitored}
         self.recalibrate(rig, {})
 

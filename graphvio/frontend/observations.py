@@ -178,7 +178,7 @@ def correspond(reference: Mapping[int, TrackedFrame], current: Mapping[int, Trac
         candidates[pair] = int(np.count_nonzero(then.has_depth))
         joined, rows[pair] = _join(
             pair, then.ids, then.has_depth, then.points, then.covariances,
-            now.ids, now.has_right, now.left, now.right,
+            now.ids, now.has_right, now.left_rays, now.right_rays,
         )  # fmt: skip
         parts.append(joined)
     if not parts:

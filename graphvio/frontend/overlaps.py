@@ -120,7 +120,7 @@ class Overlaps:
             if partner.found.stamp_ns == frame.stamp_ns:
                 there = partner.found
                 rows = np.searchsorted(frame.ids, there.ids)
-                found.append(CrossCameraMatches(partner.camera, rows, there.right))
+                found.append(CrossCameraMatches(partner.camera, rows, there.right_rays))
         return tuple(found)
 
     def found_in(self, camera: int, stamp_ns: int, leaving: Mapping[int, Leaving]) -> list[FoundThere]:
@@ -144,8 +144,8 @@ class Overlaps:
                 if there.stamp_ns != stamp_ns or not len(there.ids):
                     continue
                 _, inverse_depths, in_front = predict_pixels(
-                    there.left, np.maximum(there.points[:, 2], 0.0), partner.cameras.right_T_left, other.model_number,
-                    other.intrinsics, other.distortion,
+                    there.left_rays, np.maximum(there.points[:, 2], 0.0), partner.cameras.right_T_left,
+                    other.model_number, other.intrinsics, other.distortion,
                 )  # fmt: skip
                 kept = in_front & _agrees(there, leaving[own], self._sigma_px)
                 found.append(FoundThere(own, there.ids[kept], there.right_pixels[kept], inverse_depths[kept]))
@@ -175,7 +175,7 @@ class Overlaps:
         rows = np.flatnonzero(chosen)
         partner.matcher.allow(other.allowed)
         matches = partner.matcher.match(
-            own.pyramid, other.pyramid, frame.pixels[rows], frame.left[rows], inverse_depths[rows], slopes[rows],
+            own.pyramid, other.pyramid, frame.pixels[rows], frame.left_rays[rows], inverse_depths[rows], slopes[rows],
             own.min_gradient,
         )  # fmt: skip
         good = matches.good
@@ -184,7 +184,7 @@ class Overlaps:
         chosen[rows] = True
         found = frame.keep(chosen)
         new = TrackedFrame(
-            found.stamp_ns, found.ids, found.ages, found.pixels, found.left, matches.right[good],
+            found.stamp_ns, found.ids, found.ages, found.pixels, found.left_rays, matches.right[good],
             matches.right_pixels[good], matches.points[good], matches.covariances[good], matches.slopes[good],
             np.ones(len(rows), dtype=bool), found.frames_without_depth,
         )  # fmt: skip
@@ -225,7 +225,7 @@ def _expected(partner: _Partner, frame: TrackedFrame, motion: Float | None) -> t
     if motion is not None:
         camera = partner.cameras.left
         _, moved, in_front = predict_pixels(
-            before.left, moved, motion, camera.model_number, camera.intrinsics, camera.distortion
+            before.left_rays, moved, motion, camera.model_number, camera.intrinsics, camera.distortion
         )
     rows = np.minimum(np.searchsorted(before.ids, frame.ids), len(before.ids) - 1)
     known = (before.ids[rows] == frame.ids) & in_front[rows]

@@ -44,7 +44,7 @@ def _share(found: Bool) -> float:
     return float(found.mean()) if len(found) else 0.0
 
 
-class GradedHypothesis(NamedTuple):
+class CheckedHypothesis(NamedTuple):
     """A motion hypothesis after its own checks.
 
     Attributes:
@@ -56,9 +56,9 @@ class GradedHypothesis(NamedTuple):
     reasons: list[str]
 
 
-def graded_hypothesis(
+def checked_hypothesis(
     motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoShare, noise: float
-) -> GradedHypothesis:
+) -> CheckedHypothesis:
     """Enlarge the covariance for few points, blur, repeated images, and right images that do not confirm the left.
 
     Args:
@@ -87,11 +87,11 @@ def graded_hypothesis(
         elapsed_s = (motion.stamp_ns - frozen_since_ns) * 1e-9
         covariance = covariance + np.diag((_T.possible_speeds * elapsed_s) ** 2)
         reasons.append("every image repeats the one before")
-    return GradedHypothesis(replace(motion, covariance=covariance), reasons)
+    return CheckedHypothesis(replace(motion, covariance=covariance), reasons)
 
 
-def graded(
-    hypotheses: Sequence[GradedHypothesis], max_distance: float, *, has_length: bool = True
+def motion_with_quality(
+    hypotheses: Sequence[CheckedHypothesis], max_distance: float, *, has_length: bool = True
 ) -> tuple[RelativeMotion, Quality, str]:
     """Return the first hypothesis' motion, with a covariance that covers the others, its quality, and why.
 

@@ -25,7 +25,7 @@ def search(
     sample consensus*, CACM 24(6), 1981). ``config.hypotheses`` of each pair is the maximum; confidence 1 samples them
     all at once.
 
-    For arguments see `graphvio.frontend.selection.joint_motion_known_depths`.
+    For arguments see `graphvio.frontend.selection.searched_and_refined`.
     """
     best, sampled = predicted, 0
     while sampled < config.hypotheses:

@@ -75,7 +75,7 @@ class Refined:
 
 
 def refine(
-    rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig, known: Bool | None = None
+    rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig, known_inlier: Bool | None = None
 ) -> Refined:
     """Minimise the robust cost; directions that no point constrains get a large variance.
 
@@ -84,14 +84,15 @@ def refine(
         observations: N points of any subset of them.
         cur_T_ref: initial motion (4, 4).
         config: of this stage.
-        known: (N,) the inliers, where they are known already and the initial motion is near; else they are found first.
+        known_inlier: (N,) the inliers, where they are known already and the initial motion is near; else they are found
+            first.
     """
-    inlier = np.zeros(0, dtype=bool) if known is None else known
+    inlier = np.zeros(0, dtype=bool) if known_inlier is None else known_inlier
     start = np.ascontiguousarray(cur_T_ref)
     settings = config.pixel_sigma_px, config.cauchy_scale_px, config.max_error_px, config.sigma_inflation**2
     if config.residuals == "per_image":
         images_rig, images, rows = image_by_image(rig, observations)
-        counted = np.ones(len(rows)) if known is None else known[rows].astype(np.float64)
+        counted = np.ones(len(rows)) if known_inlier is None else known_inlier[rows].astype(np.float64)
         return Refined(*_refined_per_image(start, rig, observations, inlier, images_rig, images, counted, *settings))
     shows_noise = is_depth_known(rig, observations, config.pixel_sigma_px)
     refined = Refined(*_refined(start, rig, observations, inlier, shows_noise, *settings))
@@ -105,7 +106,7 @@ def refine(
 
 @kernel
 def _refined(
-    cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, shows_noise: Bool, sigma: float,
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, known_inlier: Bool, shows_noise: Bool, sigma: float,
     scale_px: float, max_error_px: float, inflation: float,
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
     """Compute the fields of `Refined`, in their order.
@@ -114,7 +115,7 @@ def _refined(
         cur_T_ref: (4, 4) initial motion.
         rig: of P pairs.
         observations: N points.
-        known: (N,) the inliers; no elements where they are not known.
+        known_inlier: (N,) the inliers; no elements where they are not known.
         shows_noise: (N,) points whose residuals show the noise; the depth of the others is so uncertain that it absorbs
             their error.
         sigma: pixel noise as it is modelled.
@@ -127,8 +128,8 @@ def _refined(
     points_at, pose, hessian = allocate_points(blocks), cur_T_ref, np.empty((6, 6))
     sigmas_px = np.full(len(rig.focal_px), sigma)
     errors2 = _squared_errors(pose, rig, blocks, points_at, sigmas_px)
-    is_known = len(known) == len(has_right)
-    inlier = known if is_known else np.ones(len(has_right), dtype=np.bool_)
+    is_known = len(known_inlier) == len(has_right)
+    inlier = known_inlier if is_known else np.ones(len(has_right), dtype=np.bool_)
     scale = widest
     # One loop for the search and for the last, precise round: a kernel is compiled again wherever it is called.
     for number in range(_ROUNDS_TO_FIND_INLIERS if is_known else 0, _ROUNDS_TO_FIND_INLIERS + 1):
@@ -172,7 +173,7 @@ def _only(points: Bool, wanted: Bool) -> Bool:
 
 @kernel
 def _refined_per_image(
-    cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, images_rig: RigArrays,
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, known_inlier: Bool, images_rig: RigArrays,
     images: Observations, counted: Float, sigma: float, scale_px: float, max_error_px: float, inflation: float,
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
     """As `_refined`, but at the minimum of eq. (2), of observations image by image (M,) of which some are counted."""
@@ -190,7 +191,7 @@ def _refined_per_image(
     has_right, blocks, largest2 = observations.has_right, in_blocks(observations), (max_error_px / sigma) ** 2
     points_at, sigmas_px = allocate_points(blocks), np.full(len(rig.focal_px), sigma)
     errors2 = _squared_errors(pose, rig, blocks, points_at, sigmas_px)
-    inlier = known
+    inlier = known_inlier
     if len(inlier) != len(has_right):
         inlier = errors2 < inlier_cutoff(noise_variance(errors2, has_right, largest2), largest2)
         inlier &= _is_of_an_explained_pair(observations.pair, inlier, len(sigmas_px))

@@ -101,9 +101,9 @@ def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) 
     shutter_px[:, 0] = left_px - frame.pixels
     if isinstance(group, SingleCamera):
         left, _ = group.left.unproject(left_px)
-        return replace(frame, left=left, points=np.column_stack([left, depths_then]), shutter_px=shutter_px)
+        return replace(frame, left_rays=left, points=np.column_stack([left, depths_then]), shutter_px=shutter_px)
     right_T_left = group.right_T_left
-    z = np.column_stack([frame.left, np.ones(len(depths))]) @ right_T_left[2, :3] + depths * right_T_left[2, 3]
+    z = np.column_stack([frame.left_rays, np.ones(len(depths))]) @ right_T_left[2, :3] + depths * right_T_left[2, 3]
     right_px, _ = pixels_at_stamp(group.right, frame.right_pixels, depths / np.maximum(z, _MIN_Z), motion)
     shutter_px[:, 1] = right_px - frame.right_pixels
     return replace(frame, shutter_px=shutter_px).recalibrated(group)

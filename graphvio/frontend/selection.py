@@ -15,10 +15,10 @@ from graphvio.frontend.refinement import Refined, explained, refine
 _MIN_SIGMAS = 3.0  # of a translation by whose flow depths are seen
 
 
-def joint_motion_known_depths(
+def searched_and_refined(
     rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> Refined:
-    """Estimate one motion from all pairs, with depths as they are given (section 3.1).
+    """Estimate one motion from some pairs, or from one, with depths as they are given (section 3.1).
 
     Hypotheses are scored on every pair, and the best one is refined.
 
@@ -29,15 +29,17 @@ def joint_motion_known_depths(
         config: of this stage.
         rng: source of the random triples.
     """
-    known = is_depth_known(rig, observations, config.pixel_sigma_px)
-    searched = observations if known.all() or not known.any() else observations.of_rows(known)
+    has_known_depth = is_depth_known(rig, observations, config.pixel_sigma_px)
+    searched = observations
+    if has_known_depth.any() and not has_known_depth.all():
+        searched = observations.of_rows(has_known_depth)
     return refine(rig, observations, search(rig, searched, predicted, config, rng), config)
 
 
 def joint_motion(
     rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> tuple[Refined, Observations]:
-    """Estimate a motion as `joint_motion_known_depths`, where single cameras' points may hardly have a depth yet.
+    """Estimate a motion as `searched_and_refined`, where single cameras' points may hardly have a depth yet.
 
     The flow of such a point is any that the translation can explain. Where the translation is about zero, its error
     decides, and the minimum would lie where the noise of these points is explained best. So the motion is estimated
@@ -47,13 +49,15 @@ def joint_motion(
     Returns:
         The motion on all points, and the observations with that noise.
     """
-    known = is_depth_known(rig, observations, config.pixel_sigma_px)
-    if known.all() or known.sum() < config.min_inliers:
-        refined = joint_motion_known_depths(rig, observations, predicted, config, rng)
+    has_known_depth = is_depth_known(rig, observations, config.pixel_sigma_px)
+    if has_known_depth.all() or has_known_depth.sum() < config.min_inliers:
+        refined = searched_and_refined(rig, observations, predicted, config, rng)
         return with_unknown_scales(rig, observations, refined, config), observations
-    first = joint_motion_known_depths(rig, observations.of_rows(known), predicted, config, rng)
-    covariances, pair = observations.covariances.copy(), observations.pair[~known]
-    covariances[~known] = _with_noise_of_motion(covariances[~known], pair, rig, first, config.pixel_sigma_px)
+    first = searched_and_refined(rig, observations.of_rows(has_known_depth), predicted, config, rng)
+    covariances, is_vague = observations.covariances.copy(), ~has_known_depth
+    covariances[is_vague] = _with_noise_of_motion(
+        covariances[is_vague], observations.pair[is_vague], rig, first, config.pixel_sigma_px
+    )
     observations = observations._replace(covariances=covariances)
     refined = refine(rig, observations, first.cur_T_ref, config)
     return with_unknown_scales(rig, observations, refined, config), observations
@@ -84,11 +88,10 @@ def best_pair_motion(
 ) -> Refined:
     """Estimate a motion from each pair alone, and choose the one of least global cost, eq. (4).
 
-    For arguments see `joint_motion_known_depths`; for the plain equation `graphvio.frontend.paper_method.best_pair`.
+    For arguments see `searched_and_refined`; for the plain equation `graphvio.frontend.paper_method.best_pair`.
     """
     candidates = [
-        joint_motion_known_depths(rig, observations.of_pair(pair), predicted, config, rng)
-        for pair in observations.pairs
+        searched_and_refined(rig, observations.of_pair(pair), predicted, config, rng) for pair in observations.pairs
     ]
     costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
     winner = candidates[int(np.argmin(costs))]

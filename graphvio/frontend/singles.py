@@ -13,8 +13,8 @@ from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
+from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.frontend.tracks import TrackedFrame, common_rows
-from graphvio.frontend.visual import MotionPredictor, Seen, VisualFrontend
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
@@ -26,7 +26,7 @@ _KEYFRAMES_AHEAD = 2.0  # what leaves a view until then is handed over
 _MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to predict tracks by
 
 
-class SinglesFrontend(VisualFrontend):
+class SinglesFrontend(TrackingFrontend):
     """Tracks every camera, and decides when a keyframe begins."""
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
@@ -77,7 +77,7 @@ class SinglesFrontend(VisualFrontend):
             camera_tracks={} if self._all_frozen else camera_tracks,
         )
 
-    def _advance_history(self, seen: Seen, motion_since: MotionPredictor) -> None:
+    def _advance_history(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> None:
         """Note the predicted motion since the keyframe before, by which the new one locates points."""
         reference = next(iter(seen.reference.values()), None)
         cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
@@ -85,7 +85,9 @@ class SinglesFrontend(VisualFrontend):
             for j in seen.frames:
                 self._histories[j].advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
 
-    def _begin_keyframe(self, seen: Seen, motion_since: MotionPredictor) -> tuple[Seen, dict[int, CameraTracks]]:
+    def _begin_keyframe(
+        self, seen: TrackedFrameset, motion_since: MotionPredictor
+    ) -> tuple[TrackedFrameset, dict[int, CameraTracks]]:
         """Register later tracks on these images, with handed over and new ones, which other cameras may see, too."""
         before = seen.frames
         seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
@@ -104,16 +106,16 @@ class SinglesFrontend(VisualFrontend):
 
         Those that another camera's track is a part of are found by that one.
         """
-        views = {j: self._trackers[j].view for j in frames}
+        images = {j: self._trackers[j].tracked_image for j in frames}
         of_others = {j: np.zeros(len(frames[j].ids), dtype=bool) for j in frames}
         if not searches:
             of_others = {j: self._handover.is_followed(j, frames) for j in frames}
 
         def find(j: int) -> CameraTracks:
             chosen = ~of_others[j] if wanted is None else wanted[j]
-            self._overlaps.find(j, views, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
-            handed_over = self._handover.handed_over(j, frames[j])
-            return CameraTracks(frames[j].ids, frames[j].left, self._overlaps.matches_of(j, frames[j]), handed_over)
+            self._overlaps.find(j, images, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
+            matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
+            return CameraTracks(frames[j].ids, frames[j].left_rays, matches, handed_over)
 
         return self._in_parallel(find, frames)
 
@@ -186,12 +188,12 @@ class SinglesFrontend(VisualFrontend):
             if cur_T_reference is None:
                 since_ns = reference.stamp_ns
                 cur_T_reference = motion_since(since_ns)
-            rays = np.column_stack([reference.left[then], np.ones(len(then))])
+            rays = np.column_stack([reference.left_rays[then], np.ones(len(then))])
             if cur_T_reference is not None:
                 body_R_cam = self._extrinsics.arrays.body_T_left[j][:3, :3]
                 rays = rays @ (body_R_cam.T @ cur_T_reference[:3, :3] @ body_R_cam).T
             ahead = rays[:, 2] > 0.1
-            moved = frame.left[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]
+            moved = frame.left_rays[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]
             displacements.append(np.hypot(moved[:, 0], moved[:, 1]))
         return float(np.median(np.concatenate(displacements))), since_ns, cur_T_reference is not None
 

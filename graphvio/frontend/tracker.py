@@ -59,8 +59,8 @@ class GroupTracker:
         self._body_T_left = group.left.body_T_cam
         self._next_id = 0
         self._last = replace(TrackedFrame.empty(), is_single=self._matcher is None)
-        self._left: Pyramid = ()
-        self._right: Pyramid = ()
+        self._left_pyramid: Pyramid = ()
+        self._right_pyramid: Pyramid = ()
         self._patches = KeyframePatches(group, config.tracking.window_px)
         self._noise = NoiseFilter()
         self._motion: ReadoutMotion | None = None
@@ -87,9 +87,10 @@ class GroupTracker:
             motion: of body while rolling shutters read the images out, or None if unknown.
         """
         watch = Stopwatch()
-        before, levels = self._left, max(self._config.tracking.levels, 2)
+        before, levels = self._left_pyramid, max(self._config.tracking.levels, 2)
         left, right = self._noise.filtered(left, right)
-        self._left, self._right = build_pyramid(left, levels), () if right is None else build_pyramid(right, 2)
+        self._left_pyramid = build_pyramid(left, levels)
+        self._right_pyramid = () if right is None else build_pyramid(right, 2)
         self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:
             self._matcher.allow(self._usable[1].of(right, masks[1]))
@@ -119,15 +120,12 @@ class GroupTracker:
         watch = Stopwatch()
         pixels = self._new_corners(self._last)
         watch.lap("corners")
-        n = len(pixels)
-        ids, none = self._next_id + np.arange(n), np.zeros(n, dtype=np.int64)
-        new = self._matched(self._last.stamp_ns, ids, none, pixels, np.full(n, np.nan), np.zeros((n, 2)), none, {})
-        self._next_id += n
+        new = self._start_tracks(pixels, np.full(len(pixels), np.nan))
         watch.lap("stereo")
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         if self._matcher is None and self._history.newest_ns == self._last.stamp_ns:
             points, covariances = self._first_sights.locate(
-                self._last.ids, self._last.left, self._history, self._body_T_left, self._group.left.focal_px,
+                self._last.ids, self._last.left_rays, self._history, self._body_T_left, self._group.left.focal_px,
                 self._config.motion.pixel_sigma_px,
             )  # fmt: skip
             self._last = replace(self._last, points=points, covariances=covariances)
@@ -152,18 +150,15 @@ class GroupTracker:
         both = np.concatenate([frame.pixels, pixels])
         crowded = ~thinned(both, np.ones(len(both), dtype=bool), cell_px, _MAX_TRACKS_PER_CELL)
         which = np.flatnonzero(free & ~crowded[len(frame.ids) :])
-        ids, none = self._next_id + np.arange(len(which)), np.zeros(len(which), dtype=np.int64)
-        new = self._matched(
-            frame.stamp_ns, ids, none, pixels[which], inverse_depths[which], np.zeros((len(which), 2)), none, {}
-        )
-        self._next_id += len(which)
-        self._last = frame.extended(replace(new, stage_ms={}))
-        return self._last, which[np.isin(ids, new.ids)]
+        first_id = self._next_id
+        new = self._start_tracks(pixels[which], inverse_depths[which])
+        self._last = frame.extended(new)
+        return self._last, which[new.ids - first_id]
 
     @property
-    def view(self) -> TrackedImage:
+    def tracked_image(self) -> TrackedImage:
         """The newest left image, and what is tracked in it."""
-        return TrackedImage(self._last, self._left, self._allowed, self._min_gradient)
+        return TrackedImage(self._last, self._left_pyramid, self._allowed, self._min_gradient)
 
     @property
     def are_lines_off(self) -> bool:
@@ -190,8 +185,8 @@ class GroupTracker:
 
     def keep_keyframe_patches(self) -> None:
         """Register the tracks on the newest frame's patches from now on."""
-        if self._left:
-            self._patches.take(self._last, self._left[0])
+        if self._left_pyramid:
+            self._patches.take(self._last, self._left_pyramid[0])
 
     def slant_keyframe_patches(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
         """Take depth and slant of the patches as another camera sees them, see `KeyframePatches.slant`."""
@@ -213,9 +208,9 @@ class GroupTracker:
         if left_T_left_prev is None:
             depths = np.where(last.has_depth, last.points[:, 2], np.nan)
             return last, last.pixels, depths, np.ones(len(last.ids), dtype=bool)
-        w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
+        w = _inverse_depths(last)
         pixels, inverse_depths, valid = predict_pixels(
-            last.left, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
+            last.left_rays, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
         )
         if self._motion is not None:
             pixels, inverse_depths = pixels_at_lines(camera, pixels, inverse_depths, self._motion)
@@ -240,7 +235,9 @@ class GroupTracker:
         """
         pixels, found = guess.copy(), np.zeros(len(guess), dtype=bool)
         if left_T_left_keyframe is not None and left_T_left_prev is not None:
-            pixels, found = self._patches.find(last.ids, guess, self._left[0], left_T_left_keyframe, self._min_gradient)
+            pixels, found = self._patches.find(
+                last.ids, guess, self._left_pyramid[0], left_T_left_keyframe, self._min_gradient
+            )
         watch.lap("register")
         # What leaves the image is not looked for: next to its edge something similar would be found instead.
         others = np.flatnonzero(~found & is_in_view)
@@ -253,7 +250,7 @@ class GroupTracker:
         if left_T_left_keyframe is not None:
             others = others[found[others]]
             pixels[others], _ = self._patches.find(
-                last.ids[others], pixels[others], self._left[0], left_T_left_keyframe, self._min_gradient
+                last.ids[others], pixels[others], self._left_pyramid[0], left_T_left_keyframe, self._min_gradient
             )
         watch.lap("register")
         return pixels, found
@@ -261,16 +258,16 @@ class GroupTracker:
     def _follow_again(self, before: Pyramid, last: TrackedFrame, pixels: Float, found: Bool) -> tuple[Float, Bool]:
         """Look for lost tracks where those that were found foretell them, or else where the whole image has moved."""
         camera = self._group.left
-        w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
+        w = _inverse_depths(last)
         for _ in range(_MAX_ROUNDS):
             rays, has_ray = camera.unproject(pixels)
-            moved = motion_of_found(last.left, w, rays, found & has_ray, camera.focal_px)
+            moved = motion_of_found(last.left_rays, w, rays, found & has_ray, camera.focal_px)
             if moved is not None:
                 guess, _, valid = predict_pixels(
-                    last.left, w, moved, camera.model_number, camera.intrinsics, camera.distortion
+                    last.left_rays, w, moved, camera.model_number, camera.intrinsics, camera.distortion
                 )
             else:
-                shift_px = image_shift(before[-1], self._left[-1]) * 2 ** (len(before) - 1)
+                shift_px = image_shift(before[-1], self._left_pyramid[-1]) * 2 ** (len(before) - 1)
                 guess, valid = last.pixels + shift_px, np.ones(len(found), dtype=bool)
             again = np.flatnonzero(~found & valid & camera.contains(guess))
             pixels[again], found[again] = self._tracked(before, last.pixels[again], guess[again], moved is not None)
@@ -283,7 +280,7 @@ class GroupTracker:
         settings = self._config.tracking
         return track(
             before,
-            self._left,
+            self._left_pyramid,
             then,
             guess,
             window_px=settings.window_px,
@@ -303,6 +300,16 @@ class GroupTracker:
         alone = thinned(pixels, found, self._cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
         return passes(found, alone, "crowded", rejected)
 
+    def _start_tracks(self, pixels: Float, inverse_depths: Float) -> TrackedFrame:
+        """Return new tracks of the newest image at pixels (N, 2), without those that the lens cannot have seen."""
+        n = len(pixels)
+        ids, ages = self._next_id + np.arange(n), np.zeros(n, dtype=np.int64)
+        self._next_id += n
+        frames_without_depth = np.zeros_like(ages)
+        return self._matched(
+            self._last.stamp_ns, ids, ages, pixels, inverse_depths, np.zeros((n, 2)), frames_without_depth, {}
+        )
+
     def _matched(
         self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float,
         frames_without_depth: Int, rejected: dict[str, int],
@@ -312,15 +319,17 @@ class GroupTracker:
         if self._matcher is None:
             frame = _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
             return frame if self._motion is None else as_at_stamp(frame, self._group, self._motion)
-        matches = self._matcher.match(self._left, self._right, pixels, rays, inverse_depths, slopes, self._min_gradient)
+        matches = self._matcher.match(
+            self._left_pyramid, self._right_pyramid, pixels, rays, inverse_depths, slopes, self._min_gradient
+        )
         has_depth = matches.good & has_ray
         frame = TrackedFrame(
             stamp_ns=stamp_ns,
             ids=ids,
             ages=ages,
             pixels=pixels,
-            left=rays,
-            right=matches.right,
+            left_rays=rays,
+            right_rays=matches.right,
             right_pixels=matches.right_pixels,
             points=matches.points,
             covariances=matches.covariances,
@@ -345,7 +354,7 @@ class GroupTracker:
 
     def _new_corners(self, frame: TrackedFrame) -> Float:
         """Find corners (M, 2) where no track of a frame constrains translation, weak ones too where there are few."""
-        settings, image = self._config.corners, self._left[0]
+        settings, image = self._config.corners, self._left_pyramid[0]
         tracked, occupying = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
         if frame.is_single:
             occupying = np.ones(len(tracked), dtype=bool)  # what is not near yet may turn out to be
@@ -357,6 +366,11 @@ class GroupTracker:
         tracked, occupying = np.concatenate([tracked, new]), np.concatenate([occupying, np.ones(len(new), dtype=bool)])
         weak = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, admitted)
         return np.concatenate([new, weak])
+
+
+def _inverse_depths(frame: TrackedFrame) -> Float:
+    """Return the inverse depths (N,) of a frame's tracks, 0 where they are unknown or behind the camera."""
+    return np.where(frame.has_depth, np.maximum(frame.points[:, 2], 0.0), 0.0)
 
 
 def _unmatched(
@@ -371,8 +385,8 @@ def _unmatched(
         ids=ids,
         ages=ages,
         pixels=pixels,
-        left=rays,
-        right=nothing,
+        left_rays=rays,
+        right_rays=nothing,
         right_pixels=nothing,
         points=np.column_stack([rays, depths]),
         covariances=np.tile(np.eye(3), (n, 1, 1)),

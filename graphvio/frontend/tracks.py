@@ -25,8 +25,8 @@ class TrackedFrame:
         ids: (N,) identities, increasing.
         ages: (N,) number of frames before this one in which the track was seen.
         pixels: (N, 2) in the left image.
-        left: (N, 2) normalised coordinates in the left image.
-        right: (N, 2) the same in the right image; meaningful where ``has_depth``.
+        left_rays: (N, 2) normalised coordinates in the left image.
+        right_rays: (N, 2) the same in the right image; meaningful where ``has_depth``.
         right_pixels: (N, 2) in the right image; meaningful where ``has_depth``.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.stereo`.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
@@ -46,8 +46,8 @@ class TrackedFrame:
     ids: Int
     ages: Int
     pixels: Float
-    left: Float
-    right: Float
+    left_rays: Float
+    right_rays: Float
     right_pixels: Float
     points: Float
     covariances: Float
@@ -102,14 +102,16 @@ class TrackedFrame:
 
     def recalibrated(self, group: CameraGroup) -> TrackedFrame:
         """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
-        left, has_ray = group.left.unproject(self.pixels_at_stamp)
+        rays, has_ray = group.left.unproject(self.pixels_at_stamp)
         if isinstance(group, SingleCamera):
-            points = np.column_stack([left, self.points[:, 2]])
-            return replace(self, left=left, points=points, has_depth=self.has_depth & has_ray)
+            points = np.column_stack([rays, self.points[:, 2]])
+            return replace(self, left_rays=rays, points=points, has_depth=self.has_depth & has_ray)
         right, in_right = group.right.unproject(self.right_pixels_at_stamp)
-        points, covariances, _ = triangulate(left, right, group.right_T_left, group.left.focal_px, group.right.focal_px)
+        points, covariances, _ = triangulate(rays, right, group.right_T_left, group.left.focal_px, group.right.focal_px)
         has_depth = self.has_depth & has_ray & in_right
-        return replace(self, left=left, right=right, points=points, covariances=covariances, has_depth=has_depth)
+        return replace(
+            self, left_rays=rays, right_rays=right, points=points, covariances=covariances, has_depth=has_depth
+        )
 
     @staticmethod
     def empty(stamp_ns: int = 0) -> TrackedFrame:
@@ -120,8 +122,8 @@ class TrackedFrame:
             ids=whole,
             ages=whole,
             pixels=np.zeros((0, 2)),
-            left=np.zeros((0, 2)),
-            right=np.zeros((0, 2)),
+            left_rays=np.zeros((0, 2)),
+            right_rays=np.zeros((0, 2)),
             right_pixels=np.zeros((0, 2)),
             points=np.zeros((0, 3)),
             covariances=np.zeros((0, 3, 3)),

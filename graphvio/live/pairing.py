@@ -11,7 +11,7 @@ from operator import attrgetter
 from graphvio.arrays import Image
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import FrameSet
-from graphvio.odometry.synchroniser import JumpGuard
+from graphvio.odometry.synchroniser import StampJumpFilter
 from graphvio.rig import Rig
 
 _SILENT_NS = 1_000_000_000  # a pair one of whose cameras has not delivered for so long is not waited for
@@ -255,7 +255,7 @@ class _Camera:
         self.seen: deque[int] = deque(maxlen=_REMEMBERED)
         self.last_ns: int | None = None
         self.newest_ns: int | None = None
-        self.jumps: JumpGuard[_Arrived] = JumpGuard(
+        self.jumps: StampJumpFilter[_Arrived] = StampJumpFilter(
             EventKind.IMAGE_FUTURE_STAMP, lambda stamp_ns, kind, detail: report(stamp_ns, kind, f"{name}: {detail}")
         )
 

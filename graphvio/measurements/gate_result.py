@@ -31,3 +31,8 @@ class GateResult:
     def is_clear(self) -> bool:
         """Whether the statistic is far from the threshold."""
         return not _UNCLEAR_RATIO[0] < self.statistic / self.threshold < _UNCLEAR_RATIO[1]
+
+    @property
+    def exceedance(self) -> str:
+        """Why the measurement was refused, for the detail of an event."""
+        return f"innovation {self.statistic:.1f} beyond chi-square {self.threshold:.1f}"

@@ -81,8 +81,9 @@ def equations(
         file: what the rig file, and epochs before, say of the calibration, which is unknown then; None where the
             calibration is taken for known.
     """
-    n, n_cameras, n_free = len(states.poses), states.n_cameras, 0 if file is None else len(states.calibration)
-    eliminated = Eliminated.empty(measured.structure, n_cameras if n_free else 0)
+    n, n_free = len(states.poses), 0 if file is None else len(states.calibration)
+    n_camera_parameters = states.n_camera_parameters
+    eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, cost, errors2 = visual_equations(
         states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
         ROBUST_SCALE, eliminated,
@@ -92,7 +93,7 @@ def equations(
     )
     known = 9 * n + GRAVITY + BIASES
     hessian, gradient = np.zeros((known + n_free, known + n_free)), np.zeros(known + n_free)
-    of_imu, of_views = inertial_columns(n, n_cameras, n_free), visual_columns(n, n_cameras, n_free)
+    of_imu, of_views = inertial_columns(n, n_camera_parameters, n_free), visual_columns(n, n_camera_parameters, n_free)
     hessian[np.ix_(of_imu, of_imu)] = inertial.hessian[: len(of_imu), : len(of_imu)]
     gradient[of_imu] = inertial.gradient[: len(of_imu)]
     hessian[np.ix_(of_views, of_views)] += visual_hessian
@@ -150,7 +151,7 @@ def adjust(
         if not np.isfinite(step).all():
             raise np.linalg.LinAlgError("the window's solution is not finite")
         moved = states.moved(step)
-        of_views = step[visual_columns(n, states.n_cameras, len(step) - 9 * n - GRAVITY - BIASES)]
+        of_views = step[visual_columns(n, states.n_camera_parameters, len(step) - 9 * n - GRAVITY - BIASES)]
         shifted, frames = landmarks_after(
             landmarks, measured.structure, states.cameras(measured.cameras), states.poses, moved.poses, at.eliminated,
             of_views,

@@ -16,15 +16,22 @@ from graphvio.monocular.adjustment import Adjusted, equations, evidence_of
 from graphvio.monocular.states import Prior, States
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FactorLikelihood, FilePrior, Gaussian
+from graphvio.self_calibration.evidence import (
+    EXACT,
+    MAX_FACTOR,
+    MIN_TWICE_LOG_BAYES_FACTORS,
+    Evidence,
+    FactorLikelihood,
+    FilePrior,
+    Gaussian,
+)
 from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OFFSET
-from graphvio.self_calibration.parameters import n_of_cameras
+from graphvio.self_calibration.parameters import n_camera_parameters
 from graphvio.self_calibration.prior import file_prior
 
-_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])  # against exact files, of intrinsics, and of extrinsics and the IMU
 _MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts of it that nothing has shown yet
 _FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
-_MIN_LOG_GAIN = 4.0  # twice the logarithm of the odds, by which factors change: each change moves the window's poses
+_MIN_TWICE_LOG_RATIO = 4.0  # by which factors change: each change moves the window's poses
 _FAR_OFF = 3.0  # factor of a file whose scale is not to be trusted
 _MAX_SIGMAS = 4.0  # no file is so wrong: the window is
 _WALK = 0.01  # in one second, as a share of the file's standard deviations
@@ -45,7 +52,7 @@ class WindowCalibration:
         size: number F of parameters, 0 where they are not estimated.
         factors: (G,) by which the file's errors exceed its standard deviations, of intrinsics and of extrinsics with
             the IMU; `EXACT` where the file is as good as exact.
-        log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
+        twice_log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
         are_stamps_exact: whether framesets' stamps are as good as exact. What others do to a path looks like errors of
             the calibration, of which nothing is learnt then.
         latest: what is known of all parameters, updated once a second; None before, and where they are not estimated.
@@ -54,9 +61,9 @@ class WindowCalibration:
     def __init__(self, rig: Rig, is_estimated: bool = True) -> None:
         assert rig.imu is not None
         self._rig = rig
-        whole, n_cameras = file_prior(rig), n_of_cameras(rig)
-        self._rows = np.r_[:n_cameras, n_cameras + GYRO_MATRIX : n_cameras + PARAMETERS]
-        self._biases = n_cameras + np.arange(GYRO_MATRIX)
+        whole, n = file_prior(rig), n_camera_parameters(rig)
+        self._rows = np.r_[:n, n + GYRO_MATRIX : n + PARAMETERS]
+        self._biases = n + np.arange(GYRO_MATRIX)
         self._prior = FilePrior(
             np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]), whole.group[self._rows]
         )
@@ -66,7 +73,7 @@ class WindowCalibration:
         self._bias_walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
         self.factors = self._first_factors = self.exact_factors
-        self.log_bayes_factor = 0.0
+        self.twice_log_bayes_factor = 0.0
         self.are_stamps_exact = True
         self._files: dict[tuple[float, ...], Gaussian] = {}
         self.latest: CalibrationEstimate | None = None
@@ -146,15 +153,15 @@ class WindowCalibration:
     def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Return whether a first window, adjusted with an exact file, says that its extrinsics or IMU are far off.
 
-        Arguments as `doubts_file`.
+        Arguments as `update_factors`.
         """
         if not (self.size and self.are_stamps_exact):
             return False
         likelihood = FactorLikelihood(self._kept.plus(self._evidence_of(adjusted, prior)), self._prior)
         as_stated, far_off = (likelihood(np.array([_MIN_FACTOR, factor])) for factor in (EXACT, _FAR_OFF))
-        return bool(far_off - as_stated > _MIN_LOG_BAYES_FACTORS[1])
+        return bool(far_off - as_stated > MIN_TWICE_LOG_BAYES_FACTORS[1])
 
-    def doubts_file(self, adjusted: Adjusted, prior: Prior | None) -> bool:
+    def update_factors(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Update the factors of the rig file from a window, and return whether they have changed.
 
         Args:
@@ -184,12 +191,14 @@ class WindowCalibration:
             return False
         before, self._evidence = self.factors, self._kept.plus(evidence)
         likelihood = FactorLikelihood(self._evidence, self._prior)
-        found, self.log_bayes_factor = self._evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
+        found, self.twice_log_bayes_factor = self._evidence.file_factors(
+            self._prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood
+        )
         if not (self.is_file_exact and self.is_exact(found)):
             # Errors that the tracks of one camera have in common look like those of a lens: it is not as wrong as any.
             of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
             likeliest = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
-            if self.is_file_exact or likelihood(likeliest) - likelihood(before) > _MIN_LOG_GAIN:
+            if self.is_file_exact or likelihood(likeliest) - likelihood(before) > _MIN_TWICE_LOG_RATIO:
                 self.factors = likeliest
         return not np.array_equal(self.factors, before)
 
@@ -214,7 +223,7 @@ class WindowCalibration:
         in_force[self._rows], in_force[self._biases] = states.calibration, states.biases
         self._latest_ns = stamp_ns
         self.latest = CalibrationEstimate(
-            self._rig, Gaussian(mean, information), in_force, self.factors.copy(), self.log_bayes_factor
+            self._rig, Gaussian(mean, information), in_force, self.factors.copy(), self.twice_log_bayes_factor
         )
 
 

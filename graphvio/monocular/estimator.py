@@ -29,7 +29,7 @@ from graphvio.monocular.overlap_trust import OverlapTrust, alone
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.window import KeyframeWindow
-from graphvio.monocular.window_solver import FIRST_SIGMA_PX, Solution, WindowSolver, newest_state
+from graphvio.monocular.window_solver import FIRST_MONOCULAR_SIGMA_PX, Solution, WindowSolver, newest_state
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 
@@ -181,8 +181,8 @@ class MonocularEstimator:
         if imu is not None:
             attitude = initial_attitude(*imu, self._config.initialisation)
             if attitude.is_stationary:
-                self._initialiser.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
-                self._trust.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
+                self._initialiser.set_gyro_bias_prior(attitude.gyro_bias, attitude.gyro_bias_sigma)
+                self._trust.set_gyro_bias_prior(attitude.gyro_bias, attitude.gyro_bias_sigma)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Add a state by the IMU; where that has been silent for 5 s, the epoch ends."""
@@ -367,7 +367,7 @@ class MonocularEstimator:
 
     def _new_initialiser(self, doubts_file: bool = True) -> Initialiser:
         samples_of = partial(self._samples.between, bridges=False)
-        return Initialiser(self._cameras, self._calibration, samples_of, FIRST_SIGMA_PX, doubts_file)
+        return Initialiser(self._cameras, self._calibration, samples_of, FIRST_MONOCULAR_SIGMA_PX, doubts_file)
 
     def _oldest_needed_ns(self, stamp_ns: int) -> int:
         """Return the stamp from which on IMU samples are needed at a frameset."""

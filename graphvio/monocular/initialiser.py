@@ -24,8 +24,8 @@ from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
-from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
-from graphvio.monocular.states import Prior, States, first_prior
+from graphvio.monocular.sightings import LandmarkIds, Landmarks, Views, far_off
+from graphvio.monocular.states import Prior, States, first_prior, size_m
 from graphvio.monocular.structure import located
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 from graphvio.self_calibration.evidence import Gaussian
@@ -87,7 +87,7 @@ class Initialiser:
         self.reason = "no image has come"
         self.scale_sigma = np.inf  # of the window that was tested last, as a share
 
-    def know_gyro_bias(self, gyro_bias: Float, sigma: float) -> None:
+    def set_gyro_bias_prior(self, gyro_bias: Float, sigma: float) -> None:
         """Set the gyro's bias (3,) rad/s as a standstill shows it."""
         self._gyro_bias, self._gyro_bias_sigma = gyro_bias, sigma
 
@@ -113,7 +113,7 @@ class Initialiser:
         if is_stationary or len(self._keyframes) < min_keyframes or duration_s < min_duration_s:
             self.reason = "the images show too little motion"
             return None
-        for factors in self._candidates():
+        for factors in self._next_candidates():
             try:
                 window = self._solved(factors)
             except (np.linalg.LinAlgError, MeasurementError) as error:
@@ -123,8 +123,8 @@ class Initialiser:
                 return window
         return None
 
-    def _candidates(self) -> list[Float]:
-        """Return by which factors (G,) the rig file may be wrong, the likeliest first."""
+    def _next_candidates(self) -> list[Float]:
+        """Return by which factors (G,) the rig file may be wrong, the likeliest first, and count the attempt."""
         if self._is_file_doubted:  # every other keyframe: each attempt takes as long as many framesets
             self._keyframes_in_doubt += 1
             return self._calibration.candidates[1:] if self._keyframes_in_doubt % 2 else []
@@ -140,11 +140,11 @@ class Initialiser:
         self._fits_no_motion = False
         file = self._calibration.file(factors)
         keyframes, samples = self._covered_keyframes(file)
-        names = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1)
+        landmark_ids = LandmarkIds(len(self._cameras.focal_px), MAX_KEYFRAMES - 1)
         views = []
         for keyframe in keyframes:
-            views.append(names.join(keyframe.camera_tracks))
-            names.note_keyframe()
+            views.append(landmark_ids.join(keyframe.camera_tracks))
+            landmark_ids.note_keyframe()
         states = self._first_states(samples, views, file)
         if states is None:
             return None
@@ -172,7 +172,7 @@ class Initialiser:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))
                 file = self._calibration.file(factors)
             fitting *= 1.0 - float(off.mean())
-            names.end(ids[off])
+            landmark_ids.end(ids[off])
             views = [each.without(ids[off]) for each in views]
         self.reason = self._fault(adjusted, fitting, factors) or _ambiguity(adjusted, prior, file)
         if self.reason:
@@ -182,7 +182,7 @@ class Initialiser:
             self.reason = "images and IMU contradict the rig file"
             return None
         still = [keyframe.is_stationary for keyframe in keyframes]
-        return self._in_nav(KeyframeWindow(states, views, still, names, landmarks, prior, factors))
+        return self._in_nav(KeyframeWindow(states, views, still, landmark_ids, landmarks, prior, factors))
 
     def _covered_keyframes(self, file: Gaussian | None) -> tuple[list[_Keyframe], InertialSamples]:
         """Return the keyframes that the IMU covers whatever its time offset may be, and its samples."""
@@ -274,13 +274,7 @@ def _ambiguity(adjusted: Adjusted, prior: Prior, file: Gaussian | None) -> str:
         other = adjusted.measured._replace(structure=structure._replace(odom_T_landmark=frames))
         start = replace(states, poses=scaled, velocities=factor * states.velocities)
         found = adjust(other, start, adjusted.landmarks * np.array([1.0, 1.0, 1.0 / factor]), prior, _STEPS, file)
-        apart = abs(_size(found.states) / _size(states) - 1.0)
+        apart = abs(size_m(found.states.poses[:, :3, 3]) / size_m(states.poses[:, :3, 3]) - 1.0)
         if apart > MAX_SCALE_SIGMA and found.equations.cost < cost + _MIN_WORSE:
             return f"scales {100 * apart:.0f} % apart fit as well as each other"
     return ""
-
-
-def _size(states: States) -> float:
-    """Return the rms distance of the positions from their mean, m."""
-    positions = states.poses[:, :3, 3]
-    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))

@@ -31,15 +31,15 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
     Raises:
         numpy.linalg.LinAlgError: if nothing determines the first state.
     """
-    n, n_cameras, n_free = len(states.poses), states.n_cameras, len(states.calibration)
-    eliminated = Eliminated.empty(measured.structure, n_cameras)
+    n, n_camera_parameters, n_free = len(states.poses), states.n_camera_parameters, len(states.calibration)
+    eliminated = Eliminated.empty(measured.structure, n_camera_parameters)
     visual_hessian, visual_gradient, _, _ = visual_equations(
         states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
         ROBUST_SCALE, eliminated,
     )  # fmt: skip
     size = 9 * n + GRAVITY + BIASES + n_free
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    of_views = visual_columns(n, n_cameras, n_free)
+    of_views = visual_columns(n, n_camera_parameters, n_free)
     hessian[np.ix_(of_views, of_views)] += visual_hessian
     gradient[of_views] += visual_gradient
     if n > 1:
@@ -47,7 +47,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         first = measured.samples._replace(keyframes_ns=measured.samples.keyframes_ns[:2])
         inertial = inertial_equations(first, InertialStates(two.poses, two.velocities, two.gravity, two.parameters))
         of_two = columns_of(n, np.arange(2), n_free)
-        columns = of_two[inertial_columns(2, n_cameras, n_free)]
+        columns = of_two[inertial_columns(2, n_camera_parameters, n_free)]
         known = len(columns)
         hessian[np.ix_(columns, columns)] += inertial.hessian[:known, :known]
         gradient[columns] += inertial.gradient[:known]

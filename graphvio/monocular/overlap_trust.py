@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.initialiser import Initialiser
-from graphvio.monocular.states import States
+from graphvio.monocular.states import States, size_m
 from graphvio.monocular.window import KeyframeWindow
 
 _MAX_SIGMAS = 4.0
@@ -45,10 +45,10 @@ class OverlapTrust:
         """Stamp of the oldest keyframe that is kept, or None."""
         return None if self._initialiser is None else self._initialiser.oldest_ns
 
-    def know_gyro_bias(self, gyro_bias: np.ndarray, sigma: float) -> None:
+    def set_gyro_bias_prior(self, gyro_bias: np.ndarray, sigma: float) -> None:
         """Set the gyro's bias (3,) rad/s as a standstill shows it."""
         if self._initialiser is not None:
-            self._initialiser.know_gyro_bias(gyro_bias, sigma)
+            self._initialiser.set_gyro_bias_prior(gyro_bias, sigma)
 
     def add(
         self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool, states: States | None
@@ -72,19 +72,15 @@ class OverlapTrust:
         if states is None:
             return window, "what cameras see of each other's points fits no motion"
         _, mine, theirs = np.intersect1d(window.states.stamps_ns, states.stamps_ns, return_indices=True)
-        size_m = _size_m(window.states, mine)
-        if len(mine) < _MIN_COMMON or size_m < _MIN_SIZE_M:
+        if len(mine) < _MIN_COMMON:
             return None
-        off = _size_m(states, theirs) / size_m - 1.0
+        own_size_m = size_m(window.states.poses[mine, :3, 3])
+        if own_size_m < _MIN_SIZE_M:
+            return None
+        off = size_m(states.poses[theirs, :3, 3]) / own_size_m - 1.0
         self._compared += 1
         if abs(off) < max(_MAX_SIGMAS * self._initialiser.scale_sigma, _MIN_OFF):
             if self._compared == _MAX_COMPARISONS or self._initialiser.scale_sigma < _SUFFICIENT_SIGMA:
                 self._initialiser = None
             return None
         return window, f"overlapping views show a scale that is {100 * off:+.0f} % off the accelerometer's"
-
-
-def _size_m(states: States, rows: np.ndarray) -> float:
-    """Return the rms distance of some positions from their mean."""
-    positions = states.poses[rows, :3, 3]
-    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(rows) else 0.0

@@ -73,9 +73,9 @@ def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
     """
     states, landmarks, measured, at = solved.adjusted
     structure = measured.structure
-    n_poses, n_cameras = 6 * len(states.poses), at.eliminated.by_cameras.shape[2]
-    of_cameras = 9 * len(states.poses) + GRAVITY + BIASES + np.arange(n_cameras)
-    joint, n_unknowns = covariance_of(at.hessian, np.r_[:n_poses, of_cameras]), n_poses + n_cameras
+    n_poses, n_camera_parameters = 6 * len(states.poses), at.eliminated.by_cameras.shape[2]
+    of_cameras = 9 * len(states.poses) + GRAVITY + BIASES + np.arange(n_camera_parameters)
+    joint, n_unknowns = covariance_of(at.hessian, np.r_[:n_poses, of_cameras]), n_poses + n_camera_parameters
     odom_R_body, position = states.poses[-1, :3, :3], states.poses[-1, :3, 3]
     points, covariances, known = np.zeros((len(rows), 3)), np.zeros((len(rows), 3, 3)), np.zeros(len(rows), dtype=bool)
     for i, row in enumerate(rows):

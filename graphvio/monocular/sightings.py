@@ -68,7 +68,7 @@ class Views(NamedTuple):
 _NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
 
-class LandmarkNames:
+class LandmarkIds:
     """Joins tracks to landmarks: tracks of several cameras that follow one point are one landmark.
 
     Args:
@@ -94,7 +94,7 @@ class LandmarkNames:
         of_tracks = [self._points_of(j, tracks) for j, tracks in ordered]
         ids = np.concatenate([tracks.ids for _, tracks in ordered])
         cameras = np.concatenate([np.full(len(tracks.ids), j, dtype=np.int64) for j, tracks in ordered])
-        landmarks = self._name(np.concatenate(of_tracks), ids, cameras, np.array([j for j, _ in ordered]))
+        landmarks = self._landmarks_of(np.concatenate(of_tracks), ids, cameras, np.array([j for j, _ in ordered]))
         self._tracks = cameras, ids, landmarks
         parts, ranks, begin = [], [], 0
         for j, tracks in ordered:
@@ -132,7 +132,7 @@ class LandmarkNames:
         points[rows] = ids * self._n_cameras + cameras
         return points
 
-    def _name(self, of_tracks: Int, ids: Int, cameras: Int, present: Int) -> Int:
+    def _landmarks_of(self, of_tracks: Int, ids: Int, cameras: Int, present: Int) -> Int:
         """Return the landmarks (N,) of tracks, and forget points that the cameras with images no longer see.
 
         Args:

@@ -49,13 +49,13 @@ class States:
         return np.concatenate([self.biases, other])
 
     @property
-    def n_cameras(self) -> int:
+    def n_camera_parameters(self) -> int:
         """Number of the cameras' parameters."""
         return max(len(self.calibration) - _OTHER_IMU, 0)
 
     def cameras(self, of_file: Cameras) -> Cameras:
         """Return the cameras, from those of the rig file."""
-        return of_file.moved(self.calibration[: self.n_cameras]) if self.calibration.any() else of_file
+        return of_file.moved(self.calibration[: self.n_camera_parameters]) if self.calibration.any() else of_file
 
     def of(self, kept: Int) -> States:
         """Return some of the states, by their indices."""
@@ -121,13 +121,18 @@ def columns_of(n: int, states: Int, n_free: int = 0) -> Int:
     return np.concatenate([poses, velocities, 9 * n + np.arange(GRAVITY + BIASES + n_free)])
 
 
-def inertial_columns(n: int, n_cameras: int, n_free: int) -> Int:
+def inertial_columns(n: int, n_camera_parameters: int, n_free: int) -> Int:
     """Return where the unknowns of `inertial_equations` are; where the calibration is known, of all but its last."""
     known = 9 * n + GRAVITY + BIASES
-    return np.concatenate([np.arange(known), np.arange(known + n_cameras, known + n_free)])
+    return np.concatenate([np.arange(known), np.arange(known + n_camera_parameters, known + n_free)])
 
 
-def visual_columns(n: int, n_cameras: int, n_free: int) -> Int:
+def visual_columns(n: int, n_camera_parameters: int, n_free: int) -> Int:
     """Return where the unknowns of `visual_equations` are: poses, and cameras unless the calibration is known."""
     known = 9 * n + GRAVITY + BIASES
-    return np.concatenate([np.arange(6 * n), known + np.arange(n_cameras if n_free else 0)])
+    return np.concatenate([np.arange(6 * n), known + np.arange(n_camera_parameters if n_free else 0)])
+
+
+def size_m(positions: Float) -> float:
+    """Return the rms distance of positions (K, 3) from their mean."""
+    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))

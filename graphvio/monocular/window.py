@@ -9,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.measurements.motion import CameraTracks
-from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views
+from graphvio.monocular.sightings import LandmarkIds, Landmarks, Views
 from graphvio.monocular.states import Prior, States
 
 MAX_KEYFRAMES = 14
@@ -25,7 +25,7 @@ class KeyframeWindow:
         states: in time order.
         views: of each.
         stationary: whether the rig stood there.
-        names: joins tracks to landmarks.
+        landmark_ids: joins tracks to landmarks.
         landmarks: where these are.
         prior: what is known from before.
         factors: (G,) by which the rig file's errors exceed its standard deviations.
@@ -34,7 +34,7 @@ class KeyframeWindow:
     states: States
     views: list[Views]
     stationary: list[bool]
-    names: LandmarkNames
+    landmark_ids: LandmarkIds
     landmarks: Landmarks
     prior: Prior | None
     factors: Float
@@ -60,5 +60,5 @@ class KeyframeWindow:
 
     def add_views(self, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool) -> None:
         """Add what the cameras see from the newest state: camera -> tracks."""
-        self.views.append(self.names.join(camera_tracks))
+        self.views.append(self.landmark_ids.join(camera_tracks))
         self.stationary.append(is_stationary)

@@ -24,12 +24,11 @@ from graphvio.monocular.sightings import far_off
 from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
+from graphvio.self_calibration.pixel_noise import pixel_noise
 
-FIRST_SIGMA_PX = 0.3
-_MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.12, 0.6
-_NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
+FIRST_MONOCULAR_SIGMA_PX = 0.3
+_MAX_SIGMA_PX = 0.6
 _NOISE_GAIN = 0.1  # of one keyframe
-_RAYLEIGH_MEDIAN = 1.1774
 _STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
@@ -72,7 +71,7 @@ class WindowSolver:
         self.covariance = NO_COVARIANCE
         self.first_pose_ns = 0
         self._cameras = cameras
-        self._sigma_px = FIRST_SIGMA_PX
+        self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
@@ -119,7 +118,7 @@ class WindowSolver:
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
         adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
-        if is_keyframe and calibration.doubts_file(adjusted, window.prior):
+        if is_keyframe and calibration.update_factors(adjusted, window.prior):
             measured, places = adjusted.measured, adjusted.landmarks
             adjusted = adjust(measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file())
         window.states = adjusted.states
@@ -166,8 +165,8 @@ class WindowSolver:
         off = far_off(structure, errors2, MAX_ERROR2, MAX_OFF)
         seen = np.isin(ids, window.views[-1].landmark)
         is_tracking = int((seen & ~off).sum()) >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
-        dropped = window.names.tracks_of(ids[off])
-        window.names.end(ids[off])
+        dropped = window.landmark_ids.tracks_of(ids[off])
+        window.landmark_ids.end(ids[off])
         window.views = [views.without(ids[off]) for views in window.views]
         if is_tracking:
             _leave_out_mismatches(window, structure, ids, errors2)
@@ -175,10 +174,9 @@ class WindowSolver:
 
     def _finish_keyframe(self, window: KeyframeWindow, adjusted: Adjusted) -> None:
         """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
-        window.names.note_keyframe()
+        window.landmark_ids.note_keyframe()
         if len(adjusted.equations.errors2):
-            noise = np.sqrt(np.median(adjusted.equations.errors2)) / _RAYLEIGH_MEDIAN * self._sigma_px
-            wanted = float(np.clip(_NOISE_FACTOR * noise, _MIN_SIGMA_PX, _MAX_SIGMA_PX))
+            wanted = min(pixel_noise(adjusted.equations.errors2, self._sigma_px), _MAX_SIGMA_PX)
             self._sigma_px += _NOISE_GAIN * (wanted - self._sigma_px)
         while len(window.states.poses) > MAX_KEYFRAMES:
             self._forget_first(window)
@@ -194,7 +192,7 @@ class WindowSolver:
             self._hand_over(measured.structure, states, places[leaving])
         walk = self.calibration.walk((states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9)
         window.prior = without_first(measured, states, places[leaving], window.prior, walk)
-        window.names.end(window.views[0].landmark)
+        window.landmark_ids.end(window.views[0].landmark)
         window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
         del window.stationary[0]
         self._final.append((int(states.stamps_ns[0]), states.poses[0]))
@@ -242,4 +240,4 @@ def _leave_out_mismatches(window: KeyframeWindow, structure: Structure, ids: Int
     landmarks = ids[np.searchsorted(structure.rows, rows, side="right") - 1]
     newest = window.views[-1]
     window.views[-1] = kept = newest.without_adopted(landmarks, structure.camera[rows])
-    window.names.end(np.setdiff1d(newest.landmark, kept.landmark))
+    window.landmark_ids.end(np.setdiff1d(newest.landmark, kept.landmark))

@@ -1,4 +1,4 @@
-"""Estimates and keyframe data, put together from what the stages return."""
+"""Estimates, keyframe data and views for the calibration, put together from what the stages return."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
-from graphvio.frontend.visual import VisualFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.motion import VisualResult
@@ -16,6 +16,7 @@ from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.step import NewKeyframe
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
+from graphvio.self_calibration.window import View
 
 
 def estimate_without_pose(stamp_ns: int, visual: VisualResult, stage_ms: Mapping[str, float]) -> Estimate:
@@ -80,13 +81,13 @@ def with_state(
         calibration: Knows what its errors add to the covariance of the pose.
         nav: Frame of the estimate.
     """
-    of_calibration = calibration.pose_covariance(estimator.state().nav_T_body)
+    calibration_covariance = calibration.pose_covariance(estimator.state().nav_T_body)
     state, covariance = nav.state(estimator.state()), nav.covariance(estimator.covariance)
     has_pose, has_imu = estimate.status is not Status.LOST, estimator.has_imu
     return replace(
         estimate,
         nav_T_body=state.nav_T_body if has_pose else None,
-        covariance=covariance.pose + of_calibration if has_pose else None,
+        covariance=covariance.pose + calibration_covariance if has_pose else None,
         epoch=estimator.epoch,
         velocity_nav=state.velocity_nav if has_pose else None,
         gyro_bias=state.gyro_bias if has_imu else None,
@@ -114,7 +115,7 @@ def at_stamp(estimate: Estimate, body_T_stamped: Float) -> Estimate:
 
 
 def keyframe_of(
-    frameset: FrameSet, frontend: VisualFrontend, estimator: StateEstimator, nav: NavFrame, previous_ns: int | None
+    frameset: FrameSet, frontend: TrackingFrontend, estimator: StateEstimator, nav: NavFrame, previous_ns: int | None
 ) -> NewKeyframe:
     """Return the data of a frameset from which later motions are measured.
 
@@ -143,3 +144,11 @@ def keyframe_of(
         covariance=covariance,
         located_points=estimator.located_points,
     )
+
+
+def views_at(frontend: TrackingFrontend, stamp_ns: int) -> dict[int, View]:
+    """Return what pairs and single cameras, by their index, see at the newest frameset, if it has this stamp."""
+    return {
+        j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
+        for j, frame in frontend.frames_at(stamp_ns).items()
+    }

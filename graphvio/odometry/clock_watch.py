@@ -116,7 +116,7 @@ class ClockWatch:
         learnt_s = self._learnt_s
         if not self._clock.correct(stamp_ns, shift_s + learnt_s):
             return False
-        self._synchroniser.shift_imu(-learnt_s)
+        self._synchroniser.add_to_time_offset(-learnt_s)
         self._steps.clear()
         self._found_s, self.is_doubted = None, False
         return True

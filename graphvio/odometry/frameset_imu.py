@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from graphvio.arrays import Float
@@ -13,7 +11,7 @@ from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.geometry import se3
-from graphvio.measurements.events import EventKind
+from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion, VisualResult
 from graphvio.monocular.estimator import MonocularEstimator
@@ -41,7 +39,7 @@ class FramesetImu:
         config: Config,
         synchroniser: Synchroniser,
         estimator: StateEstimator,
-        report: Callable[[int, str, str], None],
+        report: Report,
     ) -> None:
         self._timing = config.timing
         self._initialisation = config.initialisation

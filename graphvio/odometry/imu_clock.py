@@ -67,7 +67,7 @@ class ImuClock:
             self._report(stamp_ns, EventKind.IMU_CLOCK_OFF, f"{self._relation}; {self._what_is_done}")
         if self.is_too_late:
             return False
-        self._synchroniser.shift_clock(shift_s)
+        self._synchroniser.correct_imu_clock(shift_s)
         self._corrected_s = self.shift_s
         return True
 

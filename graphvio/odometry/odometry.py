@@ -20,6 +20,7 @@ from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
 from graphvio.frontend.images import ImageMask
 from graphvio.frontend.singles import SinglesFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import CORRECTED, Event
@@ -64,20 +65,21 @@ class _Predicted(NamedTuple):
     initialisations: int  # until then
 
 
-def _config_of(rig: Rig, config: Config) -> Config:
-    """Return the configuration, if the rig allows it.
+def _check_config(rig: Rig, config: Config) -> None:
+    """Check that the rig has what the configuration asks for.
 
     Raises:
         ConfigError: If the configuration asks for what such a rig does not have.
     """
-    if rig.pairs:
-        return config
-    if config.fusion.estimator == "filter" or config.fusion.estimate_time_offset:
+    if not rig.pairs and (config.fusion.estimator == "filter" or config.fusion.estimate_time_offset):
         raise ConfigError(
             "the paper's filter and the estimation of the time offset need a stereo pair, and the rig has none; use "
             "fusion.estimator: smoother and fusion.estimate_time_offset: false"
         )
-    return config
+
+
+def _frontend_class(rig: Rig) -> type[VisualFrontend | SinglesFrontend]:
+    return VisualFrontend if rig.pairs else SinglesFrontend
 
 
 def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | FilterEstimator | MonocularEstimator]:
@@ -114,9 +116,10 @@ class Odometry:
         image_mask: ImageMask | None = None,
     ) -> None:
         self.rig = rig
-        self.config = _config_of(rig, config or Config())
+        self.config = config or Config()
+        _check_config(rig, self.config)
         self.stage_ms: dict[str, float] = {}
-        self._frontend = (VisualFrontend if rig.pairs else SinglesFrontend)(rig, self.config, image_mask)
+        self._frontend: TrackingFrontend = _frontend_class(rig)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
         self._estimator: StateEstimator = _estimator_class(rig, self.config)(rig, self.config, self.report)
         self._imu = FramesetImu(rig, self.config, self._synchroniser, self._estimator, self.report)
@@ -135,12 +138,13 @@ class Odometry:
         self._finished = False
 
     def _new_calibration(self) -> OnlineCalibration:
-        rig, estimator = self.rig, self._estimator
+        rig, frontend, estimator = self.rig, self._frontend, self._estimator
         if not self.config.estimates_calibration:
             return FixedCalibration()
         if isinstance(estimator, MonocularEstimator):
-            return SinglesCalibration(rig, self._frontend, self._synchroniser, estimator, self.report)
-        return PairsCalibration(rig, self.config, self._frontend, self._synchroniser, estimator, self.report)
+            return SinglesCalibration(rig, frontend, self._synchroniser, estimator, self.report)
+        assert isinstance(frontend, VisualFrontend)
+        return PairsCalibration(rig, self.config, frontend, self._synchroniser, estimator, self.report)
 
     # ------------------------------------------------------------------ measurements in, estimates out
 
@@ -413,7 +417,8 @@ class Odometry:
         self._calibration.add(stamp_ns, visual.quality, status)
         old_R_new = self._calibration.update(stamp_ns)
         if old_R_new is not None:
-            self._calibration.correct_pose(self._nav.turn(stamp_ns, self._estimator.state().nav_T_body, old_R_new))
+            turned = self._nav.turn(stamp_ns, self._estimator.state().nav_T_body, old_R_new)
+            self._calibration.correct_pose(turned)
 
     def _publish(
         self,

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from typing import Protocol
 
 from graphvio.arrays import Float
-from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding
-from graphvio.self_calibration.window import View
 
 
 class OnlineCalibration(Protocol):
@@ -99,11 +97,3 @@ class OnlineCalibration(Protocol):
 
     def close(self) -> None:
         """End what runs beside the odometry: no frameset follows."""
-
-
-def views_at(frontend: VisualFrontend, stamp_ns: int) -> dict[int, View]:
-    """Return what pairs and single cameras, by their index, see at the newest frameset, if it has this stamp."""
-    return {
-        j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
-        for j, frame in frontend.frames_at(stamp_ns).items()
-    }

@@ -16,8 +16,8 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import CORRECTED, EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
+from graphvio.odometry.assembly import views_at
 from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
-from graphvio.odometry.online_calibration import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FullWindow
@@ -25,7 +25,7 @@ from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction
 from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
-from graphvio.self_calibration.parameters import n_of_cameras
+from graphvio.self_calibration.parameters import n_camera_parameters
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
 _MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
@@ -112,7 +112,7 @@ class PairsCalibration:
         calibration, estimator = self._calibration, self._estimator
         if self._innovation_covariance is not None:
             references = self._frontend.reference_stamps_ns
-            self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.widest)
+            self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.upper_covariance)
         is_urgent = self._frontend.are_lines_off
         # Until the calibration is trusted, motions may be refused because of it.
         is_refused = status is Status.COASTING and not calibration.is_trusted
@@ -143,7 +143,7 @@ class PairsCalibration:
         self._margin_px = margin_px
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(self.estimate.rig, margin_px, self._calibration.extrinsics)
-        change, n = self.estimate.difference - self._in_force, n_of_cameras(self._rig)
+        change, n = self.estimate.difference - self._in_force, n_camera_parameters(self._rig)
         self._in_force = self.estimate.difference
         if self._innovation_covariance is not None and self._innovation_covariance.recalibrate(change[:n]):
             self._frontend.start_keyframe()
@@ -172,7 +172,7 @@ class PairsCalibration:
         self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + self.estimate.time_offset_s
-            self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
+            self._synchroniser.add_to_time_offset(wanted_s - self._synchroniser.time_offset_s)
 
     def _turn(self) -> Float | None:
         """Return how the body of the calibration in force is turned, see `OnlineCalibration.update`."""

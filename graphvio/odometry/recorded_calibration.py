@@ -47,7 +47,7 @@ _CHANCE = 1e-3  # by which halves that agree are said not to
 
 
 @dataclass(frozen=True)
-class Agreement:
+class HalfComparison:
     """How well two halves of a recording agree in one group of parameters.
 
     Attributes:
@@ -149,13 +149,13 @@ class RecordedCalibration:
         return all(found.is_observed or found.motion == SCALE_MOTION for found in self.findings)
 
     @cached_property
-    def agreements(self) -> list[Agreement]:
+    def agreements(self) -> list[HalfComparison]:
         """How well the halves agree, group by group; empty for a short recording."""
         if self.halves is None:
             return []
         difference, covariance = difference_of(*self.halves)
         grouped = [list(group) for _, group in groupby(self.curves, lambda curve: curve.group)]
-        return [_agreement(curves, difference, covariance) for curves in grouped]
+        return [_comparison(curves, difference, covariance) for curves in grouped]
 
     @cached_property
     def curves(self) -> list[Curve]:
@@ -251,8 +251,8 @@ def _with_fixed(rig: Rig, names: Sequence[str]) -> Rig:
     )
 
 
-def _agreement(curves: list[Curve], difference: Float, covariance: Float) -> Agreement:
+def _comparison(curves: list[Curve], difference: Float, covariance: Float) -> HalfComparison:
     rows = np.array([curve.row for curve in curves])
     found, spread = rows @ difference, rows @ covariance @ rows.T
     statistic = float(found @ np.linalg.solve(spread, found))
-    return Agreement(curves[0].group, statistic, len(curves), float(np.abs(found).max()), curves[0].unit)
+    return HalfComparison(curves[0].group, statistic, len(curves), float(np.abs(found).max()), curves[0].unit)

@@ -7,16 +7,16 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.visual import VisualFrontend
+from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.monocular.estimator import MonocularEstimator
-from graphvio.odometry.online_calibration import views_at
+from graphvio.odometry.assembly import views_at
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
-from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
+from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction, findings
 from graphvio.self_calibration.prior import file_prior
@@ -41,7 +41,7 @@ class SinglesCalibration:
     def __init__(
         self,
         rig: Rig,
-        frontend: VisualFrontend,
+        frontend: TrackingFrontend,
         synchroniser: Synchroniser,
         estimator: MonocularEstimator,
         report: Report,
@@ -95,7 +95,7 @@ class SinglesCalibration:
             return
         if len(self._collector.keyframes) >= WINDOW:  # by now the IMU covers the last one
             window, self._collector.keyframes = tuple(self._collector.keyframes), []
-            self._on_full_window(FullWindow(window, self._collector.samples_of(window), FIRST_SIGMA_PX))
+            self._on_full_window(FullWindow(window, self._collector.samples_of(window), FIRST_WINDOW_SIGMA_PX))
         if self._estimator.epoch != self._epoch:
             self._epoch = self._estimator.epoch
             self._collector.restart()
@@ -112,7 +112,7 @@ class SinglesCalibration:
             return
         self._estimate = estimate
         shift_s = self._imu.time_offset_s + estimate.time_offset_s - self._synchroniser.time_offset_s
-        self._synchroniser.shift_imu(shift_s)
+        self._synchroniser.add_to_time_offset(shift_s)
         self._estimator.shift_samples(round(shift_s * 1e9))
         wrong = contradiction(self.findings)
         if wrong is not None and self._was_wrong and not self._is_reported:

@@ -14,7 +14,7 @@ from graphvio.config import Config
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import FrameSet, ImuSample
-from graphvio.odometry.spike_guard import SpikeGuard
+from graphvio.odometry.spike_filter import SpikeFilter
 from graphvio.odometry.stamp_jitter import StampJitter
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_correction import ImuCorrection
@@ -23,6 +23,7 @@ _KEPT_NS = 6_000_000_000  # of the IMU, for `Synchroniser.mean_readings`
 _MIN_INTERVAL_NS = 1_000_000  # framesets that are closer are of one instant
 _MAX_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
 _MAX_JUMP_NS = 5_000_000_000
+_MIN_COVERED = 0.95  # share of the time from which the state is initialised: samples may be missing at its ends
 
 
 class HasStamp(Protocol):
@@ -66,9 +67,9 @@ class Synchroniser:
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
         self._jitter = StampJitter()
-        self._spikes = SpikeGuard(report)
-        self._sample_jumps: JumpGuard[ImuSample] = JumpGuard(EventKind.IMU_FUTURE_STAMP, report)
-        self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
+        self._spikes = SpikeFilter(report)
+        self._sample_jumps: StampJumpFilter[ImuSample] = StampJumpFilter(EventKind.IMU_FUTURE_STAMP, report)
+        self._frameset_jumps: StampJumpFilter[FrameSet] = StampJumpFilter(EventKind.FRAMESET_FUTURE_STAMP, report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
         """Add an IMU sample, and return those that are usable now, as they were measured but for their clock."""
@@ -210,14 +211,15 @@ class Synchroniser:
         """
         at_ns = self.instant_ns(stamp_ns) + self._offset_ns
         window_ns, min_ns = (round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s))
+        min_covered_s = _MIN_COVERED * 1e-9 * min_ns
         if not self._has_imu or not self._imu.covers(at_ns):
             return None
-        for end_ns in (at_ns, at_ns + min_ns):
-            found = self._imu.segment(at_ns - window_ns, end_ns)
-            if found is not None and found[0].steps_s.sum() >= 0.95e-9 * min_ns:
+        for with_later_samples in (False, True):
+            found = self._imu.segment(at_ns - window_ns, at_ns + min_ns if with_later_samples else at_ns)
+            if found is not None and found[0].steps_s.sum() >= min_covered_s:
                 interval, n = found[0], len(found[0].steps_s)
-                if end_ns > at_ns:
-                    n = next(k for k in range(1, n + 1) if interval.steps_s[:k].sum() >= 0.95e-9 * min_ns)
+                if with_later_samples:
+                    n = next(k for k in range(1, n + 1) if interval.steps_s[:k].sum() >= min_covered_s)
                 interval = ImuInterval(
                     interval.steps_s[:n], interval.angular_velocity[:n], interval.linear_acceleration[:n]
                 )
@@ -228,17 +230,17 @@ class Synchroniser:
         """Return the means of the samples that are kept, not corrected, by the framesets' clock."""
         return self._imu.means(self._offset_ns)
 
-    def shift_clock(self, seconds: float) -> None:
+    def correct_imu_clock(self, late_s: float) -> None:
         """Correct a jump of the IMU's clock: samples to come are stamped so many seconds earlier, kept ones dropped.
 
-        In contrast to `shift_imu`, this is for a clock that has jumped, or is off by more than a calibration.
+        In contrast to `add_to_time_offset`, this is for a clock that has jumped, or is off by more than a calibration.
         """
-        self._clock_ns += round(seconds * 1e9)
+        self._clock_ns += round(late_s * 1e9)
         self._imu = ImuBuffer(self._timing.max_imu_gap_ms)
-        self._sample_jumps = JumpGuard(EventKind.IMU_FUTURE_STAMP, self._report)
-        self._spikes = SpikeGuard(self._report)
+        self._sample_jumps = StampJumpFilter(EventKind.IMU_FUTURE_STAMP, self._report)
+        self._spikes = SpikeFilter(self._report)
 
-    def shift_imu(self, seconds: float) -> None:
+    def add_to_time_offset(self, seconds: float) -> None:
         """Correct the time offset of the IMU from the framesets by so many seconds more; the samples are kept."""
         self._offset_ns += round(seconds * 1e9)
 
@@ -282,7 +284,7 @@ class Synchroniser:
         return is_silent or waited_ns > longest_ns
 
 
-class JumpGuard(Generic[Stamped]):
+class StampJumpFilter(Generic[Stamped]):
     """Accepts a jump of the clock only when a second stamp confirms it: a single wrong stamp is left out.
 
     Args:

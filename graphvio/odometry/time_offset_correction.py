@@ -50,7 +50,7 @@ class TimeOffsetCorrection:
         self._filter.update(visual.motion)
         if not self._filter.estimate.is_usable:
             return
-        self._synchroniser.shift_imu(self._filter.corrected())
+        self._synchroniser.add_to_time_offset(self._filter.corrected())
         offset_s, sigma_s = self._synchroniser.time_offset_s, self._filter.estimate.sigma_s
         off_s = offset_s - self._nominal_s
         if not self._is_reported and abs(off_s) > max(_MIN_REPORTED_S, _MIN_SIGMAS * sigma_s):

@@ -77,7 +77,7 @@ def calibrate_windows(
             sites[k] = Evidence.none(len(difference)) if left_out[k] else _site(others, solution.calibration)
             earlier = _sum(earlier, sites[k])
             history.append((window.keyframes[-1].stamp_ns, _estimate(rig, prior, earlier)))
-            earlier = earlier.forgotten(walks[k])
+            earlier = earlier.after_random_walk(walks[k])
             on_window(number * n + k + 1, _ROUNDS * n)
         if number == 0:
             factors = _factors(prior, earlier)
@@ -130,7 +130,7 @@ def _of_later(sites: Sequence[Evidence], walks: Sequence[Float]) -> list[Evidenc
     """Return what the windows after each one say of the calibration at its time."""
     later = [Evidence.none(len(sites[0].vector))]
     for site, walk in zip(reversed(sites[1:]), reversed(walks[:-1]), strict=True):
-        later.append(_sum(later[-1], site).forgotten(walk))
+        later.append(_sum(later[-1], site).after_random_walk(walk))
     return later[::-1]
 
 

@@ -16,7 +16,7 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.window import Keyframe, View, median_displacement_px
 
 WINDOW = 16  # keyframes
-FIRST_SIGMA_PX = 0.15
+FIRST_WINDOW_SIGMA_PX = 0.15
 _MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe: a standstill has no keyframes
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
 _MAX_IMU_GAP_NS = 50_000_000

@@ -56,7 +56,7 @@ class ConsiderCovariance:
         self._before_knock = carried @ self._before_knock @ carried.T
         self._newest = newest
 
-    def learn(self, difference: Float, covariance: Float) -> None:
+    def set_calibration_in_force(self, difference: Float, covariance: Float) -> None:
         """Set the calibration that is in force from now on.
 
         Args:

@@ -18,7 +18,7 @@ from graphvio.self_calibration.parameters import (
     STEREO,
     extrinsics_of,
     has_coefficient,
-    n_of_cameras,
+    n_camera_parameters,
     relative_to_first,
     slices_of_groups,
 )
@@ -92,7 +92,7 @@ def _of_singles(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
     against = f"cameras against {rig.groups[0].name}"
     for j, single in enumerate(rig.singles, start=len(rig.pairs)):
-        relative = relative_to_first(rig, j) @ unit[: n_of_cameras(rig)]
+        relative = relative_to_first(rig, j) @ unit[: n_camera_parameters(rig)]
         for i, axis in enumerate(_AXES if j > 0 else ()):
             yield Curve(f"{against}, rotation", "deg", single.name, axis, _DEG * relative[i])
             yield Curve(f"{against}, translation", "mm", single.name, axis, 1e3 * relative[3 + i])
@@ -102,7 +102,7 @@ def _of_pairs(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
     for j, pair in enumerate(rig.pairs):
         stereo = unit[slices_of_groups(rig)[j]][STEREO:]
-        relative = relative_to_first(rig, j) @ unit[: n_of_cameras(rig)]
+        relative = relative_to_first(rig, j) @ unit[: n_camera_parameters(rig)]
         for i, axis in enumerate(_AXES):
             yield Curve("left to right, rotation", "deg", pair.name, axis, _DEG * stereo[i])
         along = pair.right_T_left[:3, 3] / pair.baseline_m**2
@@ -117,7 +117,7 @@ def _of_imu(rig: Rig) -> Iterator[Curve]:
     if rig.imu is None:
         return
     unit = np.eye(_size(rig))
-    imu, extrinsics = unit[n_of_cameras(rig) :], unit[extrinsics_of(rig, 0)]
+    imu, extrinsics = unit[n_camera_parameters(rig) :], unit[extrinsics_of(rig, 0)]
     for i, axis in enumerate(_AXES):
         yield Curve("cameras to IMU, rotation", "deg", "", axis, _DEG * extrinsics[i])
         yield Curve("cameras to IMU, translation", "mm", "", axis, 1e3 * extrinsics[3 + i])
@@ -128,4 +128,4 @@ def _of_imu(rig: Rig) -> Iterator[Curve]:
 
 
 def _size(rig: Rig) -> int:
-    return n_of_cameras(rig) + (PARAMETERS if rig.imu is not None else 0)
+    return n_camera_parameters(rig) + (PARAMETERS if rig.imu is not None else 0)

@@ -11,7 +11,7 @@ from graphvio.arrays import Float
 from graphvio.rig import Rig
 from graphvio.self_calibration.evidence import EXACT, Gaussian
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import moved_cameras, n_of_cameras
+from graphvio.self_calibration.parameters import moved_cameras, n_camera_parameters
 from graphvio.self_calibration.prior import refined_sigmas
 
 
@@ -25,8 +25,8 @@ class CalibrationEstimate:
         difference: (C,) that is in force, with zero for what is exact.
         file_factors: (G,) by which factors the file's errors exceed their standard deviations: of intrinsics and
             stereo extrinsics, and of extrinsics in body and the IMU. `EXACT` where the file is as good as exact.
-        log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is very
-            strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
+        twice_log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is
+            very strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
         is_changed: whether a knock has changed the cameras since the file was made.
     """
 
@@ -34,7 +34,7 @@ class CalibrationEstimate:
     posterior: Gaussian
     difference: Float
     file_factors: Float
-    log_bayes_factor: float = 0.0
+    twice_log_bayes_factor: float = 0.0
     is_changed: bool = False
 
     @property
@@ -52,7 +52,7 @@ class CalibrationEstimate:
         """The rig with the calibration that is in force."""
         if self.is_file_exact:
             return self.file_rig
-        rig = moved_cameras(self.file_rig, self.difference[: self._n_of_cameras])
+        rig = moved_cameras(self.file_rig, self.difference[: self._n_camera_parameters])
         rig = replace(rig, calibration_sigmas=refined_sigmas(rig, self.posterior))
         if rig.imu is None:
             return rig
@@ -66,16 +66,16 @@ class CalibrationEstimate:
     @property
     def time_offset_s(self) -> float:
         """Difference of the IMU's time offset from the rig file's; 0 without an IMU."""
-        return 0.0 if self.file_rig.imu is None else float(self.difference[self._n_of_cameras + TIME_OFFSET])
+        return 0.0 if self.file_rig.imu is None else float(self.difference[self._n_camera_parameters + TIME_OFFSET])
 
     @property
     def imu_matrices(self) -> tuple[Float, Float]:
         """Errors (3, 3) of the matrices of gyro and accelerometer, see `graphvio.self_calibration.imu_model`."""
         if self.file_rig.imu is None:
             return np.zeros((3, 3)), np.zeros((3, 3))
-        of_imu = self.difference[self._n_of_cameras :]
+        of_imu = self.difference[self._n_camera_parameters :]
         return of_imu[GYRO_MATRIX:ACCEL_MATRIX].reshape(3, 3), of_imu[ACCEL_MATRIX:TIME_OFFSET].reshape(3, 3)
 
     @property
-    def _n_of_cameras(self) -> int:
-        return n_of_cameras(self.file_rig)
+    def _n_camera_parameters(self) -> int:
+        return n_camera_parameters(self.file_rig)

@@ -16,6 +16,11 @@ _SWEEPS = 3
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 MAX_FACTOR = _FACTORS[-1]
+MIN_TWICE_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
+"""Against exact files, of intrinsics and of extrinsics with the IMU.
+
+Cameras that are not exact reach hundreds with the first image.
+"""
 
 
 class Gaussian(NamedTuple):
@@ -102,7 +107,7 @@ class Evidence(NamedTuple):
         information = self.information + np.linalg.inv(prior.with_factors(factors))
         return Gaussian(np.asarray(np.linalg.solve(information, self.vector)), np.asarray(information))
 
-    def forgotten(self, walk: Float) -> Evidence:
+    def after_random_walk(self, walk: Float) -> Evidence:
         """Return the likelihood after a random walk of the calibration with a covariance (C, C)."""
         kept = np.linalg.inv(np.eye(len(walk)) + self.information @ walk)
         information = kept @ self.information
@@ -116,7 +121,7 @@ class Evidence(NamedTuple):
         )
 
     def file_factors(
-        self, prior: FilePrior, min_gains: Float, likelihood: FactorLikelihood | None = None
+        self, prior: FilePrior, min_twice_log_ratios: Float, likelihood: FactorLikelihood | None = None
     ) -> tuple[Float, float]:
         """Return by which factors the rig file's errors exceed its standard deviations, by maximum likelihood.
 
@@ -125,8 +130,8 @@ class Evidence(NamedTuple):
 
         Args:
             prior: of the calibration.
-            min_gains: (G,) threshold on twice the log likelihood ratio against an exact file, above which a group is
-                taken to be inexact.
+            min_twice_log_ratios: (G,) threshold on twice the log likelihood ratio against an exact file, above which a
+                group is taken to be inexact.
             likelihood: of the same evidence and prior, if there is one already.
 
         Returns:
@@ -136,7 +141,7 @@ class Evidence(NamedTuple):
         likelihood = likelihood or FactorLikelihood(self, prior)
         groups = list(range(prior.n_groups))
         # Two groups may explain the same, and the one that is varied first then takes it all: each is first once.
-        maxima = [_ascended(likelihood, groups[first:] + groups[:first], min_gains) for first in groups]
+        maxima = [_ascended(likelihood, groups[first:] + groups[:first], min_twice_log_ratios) for first in groups]
         factors = max(maxima, key=likelihood)
         return factors, likelihood(factors) - likelihood(np.full(prior.n_groups, EXACT))
 
@@ -174,18 +179,19 @@ class FactorLikelihood:
 
     def _computed(self, factors: Float) -> float:
         prior, evidence = self._prior, self._evidence
-        each = prior.of_each(factors)
-        prior_information: Float = self._information / (each * each[:, None])
+        factor_of_each = prior.of_each(factors)
+        prior_information: Float = self._information / (factor_of_each * factor_of_each[:, None])
+        scales = factor_of_each  # their product is the root of the prior's determinant, up to a constant
         if prior.change is not None:
             covariance = prior.with_factors(factors)
-            prior_information, each = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
+            prior_information, scales = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
         lower = cholesky(evidence.information + prior_information)
         fitted = solve_lower(lower, evidence.vector.reshape(1, -1))[0]
-        likelihood = float(fitted @ fitted - 2.0 * np.log(each * np.diag(lower)).sum())
+        likelihood = float(fitted @ fitted - 2.0 * np.log(scales * np.diag(lower)).sum())
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite
 
 
-def _ascended(likelihood: FactorLikelihood, order: Sequence[int], min_gains: Float) -> Float:
+def _ascended(likelihood: FactorLikelihood, order: Sequence[int], min_twice_log_ratios: Float) -> Float:
     """Return the factors (G,) to which a coordinate ascent leads from an exact file, for an order of the groups."""
     factors = np.full(len(order), EXACT)
     for _ in range(_SWEEPS):
@@ -196,7 +202,7 @@ def _ascended(likelihood: FactorLikelihood, order: Sequence[int], min_gains: Flo
                 factors[group] = factor
                 likelihoods.append(likelihood(factors))
             found = int(np.argmax(likelihoods))
-            if likelihoods[found] - likelihoods[0] < min_gains[group]:
+            if likelihoods[found] - likelihoods[0] < min_twice_log_ratios[group]:
                 found = 0
             factors[group] = _FACTORS[found]
         if np.array_equal(factors, before):

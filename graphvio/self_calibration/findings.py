@@ -18,7 +18,7 @@ from graphvio.self_calibration.parameters import (
     INTRINSICS,
     STEREO,
     extrinsics_of,
-    n_of_cameras,
+    n_camera_parameters,
     relative_to_first,
     slices_of_groups,
 )
@@ -135,12 +135,12 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
             name = f"camera {group.name}"
             yield from _of_lens(group.left, own, 100.0 * SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX)
         if j > 0:
-            relative = relative_to_first(rig, j) @ whole[: n_of_cameras(rig)]
+            relative = relative_to_first(rig, j) @ whole[: n_camera_parameters(rig)]
             yield f"{name}, rotation against {first}", "deg", deg, relative[:3], 0.03, _TURN
             yield f"{name}, translation against {first}", "mm", 1e3, relative[3:], 3.0, _TURN
     if rig.imu is None:
         return
-    at, extrinsics = n_of_cameras(rig), whole[extrinsics_of(rig, 0)]
+    at, extrinsics = n_camera_parameters(rig), whole[extrinsics_of(rig, 0)]
     yield "cameras to IMU, rotation", "deg", deg, extrinsics[:3], 0.1, _TURN
     yield "cameras to IMU, translation", "mm", 1e3, extrinsics[3:], 3.0, _TURN
     yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN

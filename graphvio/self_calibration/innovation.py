@@ -8,7 +8,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import about_origin, depths_of_pair, extrinsics_of, n_of_cameras
+from graphvio.self_calibration.parameters import about_origin, depths_of_pair, extrinsics_of, n_camera_parameters
 from graphvio.self_calibration.prior import extrinsic_covariances
 
 _ERROR_SHARE = 0.2  # isotropic share added, since depth errors away from the image centre act in other directions
@@ -29,7 +29,7 @@ class InnovationErrors:
     """
 
     def __init__(self, covariance: Float, rig: Rig) -> None:
-        n, to_origin = n_of_cameras(rig), about_origin(rig, 0)
+        n, to_origin = n_camera_parameters(rig), about_origin(rig, 0)
         imu = covariance[n:, n:]
         self._covariance_in_body = to_origin @ covariance[extrinsics_of(rig, 0), extrinsics_of(rig, 0)] @ to_origin.T
         self._relative_covariances = extrinsic_covariances(rig, covariance)

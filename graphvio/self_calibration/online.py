@@ -20,24 +20,27 @@ from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
-from graphvio.self_calibration.collector import FIRST_SIGMA_PX, WINDOW, FullWindow, WindowCollector
+from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, FactorLikelihood, Gaussian
+from graphvio.self_calibration.evidence import (
+    EXACT,
+    MAX_FACTOR,
+    MIN_TWICE_LOG_BAYES_FACTORS,
+    Evidence,
+    FactorLikelihood,
+    Gaussian,
+)
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
-from graphvio.self_calibration.parameters import RigCalibration, n_of_cameras
+from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
+from graphvio.self_calibration.pixel_noise import pixel_noise
 from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe, View
 
-_MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
-_NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
-_RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
-"""Against exact files, of cameras and of extrinsics. Cameras that are not exact reach hundreds with the first image."""
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
@@ -69,7 +72,7 @@ class _Adjusted(NamedTuple):
     evidence: Evidence
     estimate: CalibrationEstimate
     extrinsics: dict[int, Float]
-    widest: Float
+    upper_covariance: Float
     covariance: Float  # of the cameras' parameters that come into force
     by_cameras: Float
     window: tuple[Keyframe, ...]
@@ -87,7 +90,8 @@ class SelfCalibration:
         extrinsics: index of a pair or single camera -> covariance (6, 6) of its pose relative to the first pair, see
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
-        widest: (C, C) covariance of what is known, if the file may be as wrong as any.
+        upper_covariance: (C, C) covariance of the calibration if the rig file's standard deviations are all scaled by
+            `MAX_FACTOR`; used by the innovation test.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
     """
@@ -96,8 +100,8 @@ class SelfCalibration:
         self._rig = rig
         self._nominal = RigCalibration.of(rig)
         self._prior = file_prior(rig)
-        widest = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
-        self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(widest)))
+        upper_covariance = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
+        self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(upper_covariance)))
         self._walk = walk_per_second(rig, self._prior, WALK)
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         n_groups = self._prior.n_groups
@@ -105,21 +109,21 @@ class SelfCalibration:
         exact = np.full(n_groups, EXACT)
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.extrinsics: dict[int, Float] = {}
-        self.widest = widest
+        self.upper_covariance = upper_covariance
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
         self._in_force = self._nominal
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
-        self._sigma_px = FIRST_SIGMA_PX
+        self._sigma_px = FIRST_WINDOW_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
         self._used_windows = 0  # full ones, without those that are left out
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
-        self._consider = ConsiderCovariance(self._n_cameras)
+        self._consider = ConsiderCovariance(self._n_camera_parameters)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="graphvio-calibration")
 
     def close(self) -> None:
@@ -202,37 +206,11 @@ class SelfCalibration:
             self._due_in -= 1
             return False
         pending, self._pending = self._pending, None
-        try:
-            adjusted = pending.result()
-        except np.linalg.LinAlgError:
-            return False  # measurements that determine nothing
-        except RigError:
-            # The estimated IMU parameters are outside what Imu accepts, so the IMU's measurements must be wrong.
+        adjusted = _finished_adjustment(pending)
+        if adjusted is None or not self._is_acceptable(adjusted):
             return False
-        prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
-        if not solution.has_converged:
-            return False
-        if self.has_full_window and not prior.is_confirmed_by(solution.calibration):
-            self._refuse(is_full)
-            return False
-        if not (np.abs(solution.calibration.mean) <= self._largest).all():  # also rejects NaN
-            return False  # no rig file is so wrong: the measurements are
         was_exact = self.estimate.is_file_exact
-        if self.has_full_window and was_exact and not (is_full or adjusted.estimate.is_file_exact):
-            return False  # what a full window has confirmed, a part of one does not refute: it may be the scene's fault
-        if is_full:
-            self._evidence, self._refused = evidence, 0
-            self._used_windows += 1
-        if (
-            len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
-            and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
-        ):
-            noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
-            self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
-        self._consider.extend(adjusted.window, adjusted.by_cameras)
-        self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
-        self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
-        self._in_force = self._nominal.moved(self.estimate.difference[: self._n_cameras])
+        self._put_in_force(adjusted)
         return not (was_exact and self.estimate.is_file_exact)
 
     @property
@@ -243,9 +221,9 @@ class SelfCalibration:
         return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
 
     @property
-    def _n_cameras(self) -> int:
+    def _n_camera_parameters(self) -> int:
         """Number of the cameras' parameters, the first ones of all."""
-        return n_of_cameras(self._rig)
+        return n_camera_parameters(self._rig)
 
     @property
     def has_full_window(self) -> bool:
@@ -260,6 +238,35 @@ class SelfCalibration:
     @property
     def _pace(self) -> _Pace:
         return _PACES[min(self._full_windows, len(_PACES) - 1)]
+
+    def _is_acceptable(self, adjusted: _Adjusted) -> bool:
+        """Return whether an adjustment may come into force; one that contradicts those before it counts as refused."""
+        calibration = adjusted.solution.calibration
+        if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
+            self._refuse(adjusted.is_full)
+            return False
+        if not (np.abs(calibration.mean) <= self._largest).all():  # also rejects NaN
+            return False  # no rig file is so wrong: the measurements are
+        # What a full window has confirmed, a part of one does not refute: it may be the scene's fault.
+        is_confirmed = self.has_full_window and self.estimate.is_file_exact
+        return adjusted.is_full or adjusted.estimate.is_file_exact or not is_confirmed
+
+    def _put_in_force(self, adjusted: _Adjusted) -> None:
+        """Use an adjustment's result from now on, and its noise for the next windows."""
+        if adjusted.is_full:
+            self._evidence, self._refused = adjusted.evidence, 0
+            self._used_windows += 1
+        solution, n = adjusted.solution, self._n_camera_parameters
+        if (
+            len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
+            and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
+        ):
+            self._sigma_px = pixel_noise(solution.errors2, self._sigma_px)
+        self._consider.extend(adjusted.window, adjusted.by_cameras)
+        self._consider.set_calibration_in_force(adjusted.estimate.difference[:n], adjusted.covariance)
+        self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
+        self.upper_covariance = adjusted.upper_covariance
+        self._in_force = self._nominal.moved(self.estimate.difference[:n])
 
     def _refuse(self, is_full: bool) -> None:
         """Discard a window that contradicts those before it; several such windows are a knock."""
@@ -280,7 +287,7 @@ class SelfCalibration:
         """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
         self._drop_pending()
         change = knock_covariance(self._rig, len(self._walk), groups)
-        self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
+        self._evidence, self._prior = self._evidence.after_random_walk(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self._used_windows, self._agreeing, self._refused = 0, 0, 0
         self.restarts += 1
@@ -302,7 +309,7 @@ class SelfCalibration:
         if is_full := len(window) >= WINDOW:
             self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
-            self._evidence = self._evidence.forgotten(duration_s * self._walk)
+            self._evidence = self._evidence.after_random_walk(duration_s * self._walk)
         assumed = _assumed(self.estimate.file_factors)
         prior = self._evidence.given(self._prior, assumed)
         samples, difference = self._collector.samples_of(window), self.estimate.posterior.mean
@@ -322,25 +329,25 @@ class SelfCalibration:
         """Adjust a window; what is read here does not change while an adjustment is pending."""
         await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
-        evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
+        evidence, likelihood, factors, twice_log_bayes_factor = self._judged(prior, solution)
         if solution.has_converged and not np.array_equal(_assumed(factors), assumed):
             # What the window says was linearised where another file led it.
             prior = self._evidence.given(self._prior, _assumed(factors))
             solution = adjusted(window, samples, self._nominal, solution.calibration.mean, prior, self._sigma_px)
-            evidence, likelihood, factors, log_bayes_factor = self._judged(prior, solution)
+            evidence, likelihood, factors, twice_log_bayes_factor = self._judged(prior, solution)
         posterior = evidence.given(self._prior, _assumed(factors))
-        n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
+        n, in_force = self._n_camera_parameters, np.zeros_like(difference)
         is_changed = self._prior.change is not None
         if is_changed or (factors != EXACT).any():
             in_force = evidence.given(self._prior, factors).mean
-        covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n_cameras, :n_cameras]
+        covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n, :n]
         extrinsics = {}
-        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
+        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, twice_log_bayes_factor, is_changed)
         _ = estimate.rig  # build the rig now: it raises RigError here rather than later in the odometry's thread
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
             extrinsics = extrinsic_covariances(self._rig, anywhere.covariance)
-        by_cameras = solution.poses_by_cameras(n_cameras)
+        by_cameras = solution.poses_by_cameras(n)
         return _Adjusted(
             prior,
             solution,
@@ -358,7 +365,7 @@ class SelfCalibration:
         """Return what a window and those before say, its likelihood, the file's factors, and their Bayes factor."""
         evidence = self._evidence.with_window(prior, solution.calibration)
         likelihood = FactorLikelihood(evidence, self._prior)
-        return evidence, likelihood, *evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS, likelihood)
+        return evidence, likelihood, *evidence.file_factors(self._prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood)
 
 
 def warm_up_adjustment(rig: Rig) -> None:
@@ -371,11 +378,23 @@ def warm_up_adjustment(rig: Rig) -> None:
         calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
     prior = calibration.estimate.posterior
     samples = calibration._collector.samples_of(keyframes)
-    adjusted(keyframes, samples, calibration._nominal, prior.mean, prior, FIRST_SIGMA_PX)
+    adjusted(keyframes, samples, calibration._nominal, prior.mean, prior, FIRST_WINDOW_SIGMA_PX)
     calibration.close()
     information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
     solve_lower(cholesky(information), right)
     solve_rows(information, right)
+
+
+def _finished_adjustment(pending: Future[_Adjusted]) -> _Adjusted | None:
+    """Return an adjustment when it is done, or None where it says nothing."""
+    try:
+        adjusted = pending.result()
+    except np.linalg.LinAlgError:
+        return None  # measurements that determine nothing
+    except RigError:
+        # The estimated IMU parameters are outside what Imu accepts, so the IMU's measurements must be wrong.
+        return None
+    return adjusted if adjusted.solution.has_converged else None
 
 
 def _assumed(factors: Float) -> Float:

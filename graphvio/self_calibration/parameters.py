@@ -50,7 +50,7 @@ def parameter_names(rig: Rig) -> list[str]:
     return names
 
 
-def n_of_cameras(rig: Rig) -> int:
+def n_camera_parameters(rig: Rig) -> int:
     """Return the number of a rig's parameters without those of its IMU."""
     return PAIR * len(rig.pairs) + SINGLE * len(rig.singles)
 
@@ -69,7 +69,7 @@ def extrinsics_of(rig: Rig, j: int) -> slice:
 
 
 def moved_cameras(rig: Rig, difference: Float) -> Rig:
-    """Return a rig whose cameras differ by a vector (`n_of_cameras`,)."""
+    """Return a rig whose cameras differ by a vector (`n_camera_parameters`,)."""
     return RigCalibration.of(rig).moved(difference).applied_to(rig)
 
 
@@ -86,11 +86,11 @@ def about_origin(rig: Rig, j: int) -> Float:
 
 
 def depths_of_pair(rig: Rig, j: int) -> Float:
-    """Return the derivatives (2, `n_of_cameras`) of what a pair's calibration adds to inverse depths in its left view.
+    """Return the derivatives (2, `n_camera_parameters`) of what a pair's calibration adds to its inverse depths.
 
     The first row is the offset of all of them, 1/m, in the middle of the image; the second one is a share of each.
     """
-    rows, pair = np.zeros((2, n_of_cameras(rig))), rig.pairs[j]
+    rows, pair = np.zeros((2, n_camera_parameters(rig))), rig.pairs[j]
     own = rows[:, slices_of_groups(rig)[j]]
     right_T_left = pair.right.cam_T_body @ pair.left.body_T_cam
     right_R_left, baseline = right_T_left[:3, :3], right_T_left[:3, 3]
@@ -107,11 +107,11 @@ def depths_of_pair(rig: Rig, j: int) -> Float:
 
 
 def relative_to_first(rig: Rig, j: int) -> Float:
-    """Return the derivatives (6, `n_of_cameras`) of a group's rotation and translation in body, seen from group 0.
+    """Return the derivatives (6, `n_camera_parameters`) of a group's pose in body, seen from group 0.
 
     Where body turns or moves against all cameras, their extrinsics change, and none of these differences does.
     """
-    rows = np.zeros((6, n_of_cameras(rig)))
+    rows = np.zeros((6, n_camera_parameters(rig)))
     first, own = rows[:, extrinsics_of(rig, 0)], rows[:, extrinsics_of(rig, j)]
     first -= np.eye(6)
     own += np.eye(6)
@@ -155,14 +155,14 @@ class RigCalibration(NamedTuple):
 
     @property
     def columns(self) -> Int:
-        """Where the parameters (`n_of_cameras`,) are among (G * PAIR,), where single cameras have as many as pairs."""
+        """Where the parameters (C,) are among (G * PAIR,), where single cameras have as many as pairs."""
         of_pair, of_single = np.arange(PAIR), np.r_[LEFT:CAMERA, BODY:PAIR]
         return np.concatenate(
             [j * PAIR + (of_single if is_single else of_pair) for j, is_single in enumerate(self.is_single)]
         )
 
     def moved(self, difference: Float) -> RigCalibration:
-        """Return the calibration that differs from this one by a vector (`n_of_cameras`,)."""
+        """Return the calibration that differs from this one by a vector (`n_camera_parameters`,)."""
         each = np.zeros((len(self.models), PAIR))
         each.ravel()[self.columns] = difference
         right_T_left, body_T_left = self.right_T_left.copy(), self.body_T_left.copy()

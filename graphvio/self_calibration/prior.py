@@ -26,7 +26,7 @@ from graphvio.self_calibration.parameters import (
     about_origin,
     extrinsics_of,
     has_coefficient,
-    n_of_cameras,
+    n_camera_parameters,
     relative_to_first,
     slices_of_groups,
 )
@@ -72,7 +72,7 @@ def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
     """
     walk = share**2 * prior.covariance
     if rig.imu is not None:
-        biases = n_of_cameras(rig) + np.arange(GYRO_BIAS, GYRO_MATRIX)
+        biases = n_camera_parameters(rig) + np.arange(GYRO_BIAS, GYRO_MATRIX)
         walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         walk[biases, biases] = (_BIAS_WALK_FACTOR * walks) ** 2
     return walk
@@ -88,7 +88,7 @@ def extrinsic_covariances(rig: Rig, covariance: Float) -> dict[int, Float]:
     Returns:
         Index, of all but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``.
     """
-    n = n_of_cameras(rig)
+    n = n_camera_parameters(rig)
     of_cameras, found = covariance[:n, :n], {}
     for j in range(1, len(rig.groups)):
         rows = about_origin(rig, j) @ relative_to_first(rig, j)
@@ -104,7 +104,7 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
         posterior: of the difference from a rig file.
     """
     covariance, known = posterior.covariance, rig.calibration_sigmas
-    of_cameras = covariance[: n_of_cameras(rig), : n_of_cameras(rig)]
+    of_cameras = covariance[: n_camera_parameters(rig), : n_camera_parameters(rig)]
     of_group = [_sigmas(covariance, own) for own in slices_of_groups(rig)]
     first = of_group[0][-6:]
     rows = [relative_to_first(rig, j) for j in range(1, len(rig.groups))]
@@ -162,7 +162,7 @@ def _sigmas_of_imu(known: CalibrationSigmas) -> Float:
 
 def _covariance_of_cameras(rig: Rig) -> Float:
     """Return the covariance of the cameras' parameters, see `graphvio.self_calibration.parameters`."""
-    known, n = rig.calibration_sigmas, n_of_cameras(rig)
+    known, n = rig.calibration_sigmas, n_camera_parameters(rig)
     covariance = np.zeros((n, n))
     own = [_sigmas_of_pair(pair, known) for pair in rig.pairs]
     own += [_sigmas_of_lens(single.left, known) for single in rig.singles]

@@ -80,18 +80,18 @@ class Solution(NamedTuple):
     hessian: Float
     has_converged: bool
 
-    def poses_by_cameras(self, n_cameras: int) -> Float:
+    def poses_by_cameras(self, n_camera_parameters: int) -> Float:
         """Return how the poses depend on the cameras' parameters, the first ones of the calibration.
 
         Returns:
-            (K, 6, n_cameras) derivatives of the poses, errors in their own frames; the other unknowns follow.
+            (K, 6, n_camera_parameters) derivatives of the poses, errors in their own frames; the other unknowns follow.
         """
         n = 6 * len(self.states.poses)
-        cameras = np.arange(n, n + n_cameras)
-        others = np.r_[6:n, n + n_cameras : len(self.hessian)]
+        cameras = np.arange(n, n + n_camera_parameters)
+        others = np.r_[6:n, n + n_camera_parameters : len(self.hessian)]
         by_cameras = -solve_rows(self.hessian[np.ix_(others, others)], self.hessian[np.ix_(cameras, others)])
-        poses = np.concatenate([np.zeros((n_cameras, 6)), by_cameras[:, : n - 6]], axis=1)
-        return np.ascontiguousarray(poses.T).reshape(-1, 6, n_cameras)
+        poses = np.concatenate([np.zeros((n_camera_parameters, 6)), by_cameras[:, : n - 6]], axis=1)
+        return np.ascontiguousarray(poses.T).reshape(-1, 6, n_camera_parameters)
 
 
 class _Linearised(NamedTuple):
@@ -156,13 +156,13 @@ def _linearise(
     found: Eliminated,
 ) -> _Linearised:
     """Linearise over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``, with the landmarks eliminated."""
-    n, c, n_cameras = len(states.poses), len(difference), len(nominal.columns)
+    n, c, n_camera_parameters = len(states.poses), len(difference), len(nominal.columns)
     size = 6 * n + c + (3 * n + 3 if window.samples is not None else 0)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    cameras, columns = slice(0, 6 * n + n_cameras), _visual_columns(n, nominal)
+    cameras, columns = slice(0, 6 * n + n_camera_parameters), _visual_columns(n, nominal)
     visual_size = 6 * n + PAIR * len(nominal.models)
     visual_hessian, visual_gradient = np.zeros((visual_size, visual_size)), np.zeros(visual_size)
-    moved = nominal.moved(difference[:n_cameras])
+    moved = nominal.moved(difference[:n_camera_parameters])
     cost, errors2 = eliminate_landmarks(
         states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE, damping,
         visual_hessian, visual_gradient, found,
@@ -183,9 +183,10 @@ def _linearise(
     imu_errors2 = np.zeros(0)
     if window.samples is not None:
         inertial = inertial_equations(
-            window.samples, InertialStates(states.poses, states.velocities, states.gravity, difference[n_cameras:])
+            window.samples,
+            InertialStates(states.poses, states.velocities, states.gravity, difference[n_camera_parameters:]),
         )
-        at = _inertial_columns(n, c, n_cameras)
+        at = _inertial_columns(n, c, n_camera_parameters)
         hessian[np.ix_(at, at)] += inertial.hessian
         gradient[at] += inertial.gradient
         cost += inertial.cost + _add_loose(states, first, hessian, gradient, 6 * n + c)
@@ -198,11 +199,11 @@ def _visual_columns(n: int, nominal: RigCalibration) -> Int:
     return np.concatenate([np.arange(6 * n), 6 * n + nominal.columns])
 
 
-def _inertial_columns(n: int, c: int, n_cameras: int) -> Int:
+def _inertial_columns(n: int, c: int, n_camera_parameters: int) -> Int:
     """Return where ``[poses, velocities, gravity, parameters]`` of K keyframes are among a window's unknowns."""
     after = 6 * n + c
     return np.concatenate(
-        [np.arange(6 * n), np.arange(after, after + 3 * n + 3), 6 * n + n_cameras + np.arange(PARAMETERS)]
+        [np.arange(6 * n), np.arange(after, after + 3 * n + 3), 6 * n + n_camera_parameters + np.arange(PARAMETERS)]
     )
 
 
@@ -239,14 +240,14 @@ def _moved(
     window: Window, states: States, nominal: RigCalibration, difference: Float, eliminated: Eliminated, step: Float
 ) -> tuple[Window, States]:
     """Return the states after a step, and the window with the frames of the landmarks then; these follow from it."""
-    n, n_cameras = len(states.poses), len(nominal.columns)
+    n, n_camera_parameters = len(states.poses), len(nominal.columns)
     poses = states.poses.copy()
     for k, of_pose in enumerate(step[: 6 * n].reshape(n, 6)):
         poses[k, :3, 3] += states.poses[k, :3, :3] @ of_pose[3:]
         poses[k, :3, :3] = states.poses[k, :3, :3] @ so3_exp(of_pose[:3].copy())
     of_cameras, columns = np.zeros(6 * n + PAIR * len(nominal.models)), _visual_columns(n, nominal)
     of_cameras[columns] = step[: len(columns)]
-    calibration = nominal.moved(difference[:n_cameras])
+    calibration = nominal.moved(difference[:n_camera_parameters])
     landmarks, frames = landmarks_after(
         states.landmarks, window.tracks, calibration, states.poses, poses, eliminated, of_cameras
     )

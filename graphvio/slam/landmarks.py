@@ -48,7 +48,7 @@ def landmarks_of(rig: Rig, keyframe: NewKeyframe, pixel_sigma_px: float, describ
         group, n = rig.groups[j], len(frame.ids)
         right_px = np.full((n, 2), np.nan)
         if isinstance(group, StereoPair):
-            right_px, _ = group.right.project(np.column_stack([frame.right, np.ones(n)]))
+            right_px, _ = group.right.project(np.column_stack([frame.right_rays, np.ones(n)]))
         image = keyframe.images[j][0]
         descriptors = np.zeros((n, 0), dtype=np.uint8) if describe is None else describe(image, frame.pixels)
         which = np.full(n, j, dtype=np.int64)

@@ -292,11 +292,7 @@ class FilterEstimator:
         gate_result = self._running.gate(measurement, self._config.filter.gate_probability)
         self.gate_results[measurement.name] = gate_result
         if not gate_result.accepted:
-            self._report(
-                self._latest_ns,
-                _GATED[measurement.name],
-                f"innovation {gate_result.statistic:.1f} beyond chi-square {gate_result.threshold:.1f}",
-            )
+            self._report(self._latest_ns, _GATED[measurement.name], gate_result.exceedance)
         return gate_result.accepted
 
     def _reinitialise_after_gap(self, stamp_ns: int, gap_s: float) -> None:

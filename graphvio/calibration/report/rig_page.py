@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.errors import CalibrationError
-from graphvio.odometry.recorded_calibration import Agreement, RecordedCalibration
+from graphvio.odometry.recorded_calibration import HalfComparison, RecordedCalibration
 from graphvio.reporting.html import render
 from graphvio.results.calibration_plot import CalibrationHistory
 from graphvio.rig_files.native import to_text
@@ -22,7 +22,7 @@ def rows_of(found: RecordedCalibration) -> list[tuple[str, ...]]:
     return [_row(each) for each in found.findings]
 
 
-def agreement_in_words(each: Agreement) -> str:
+def agreement_in_words(each: HalfComparison) -> str:
     """Say how well two halves agree in one group."""
     remark = "agree" if each.is_good else "do not agree"
     unit = f" {each.unit}" if each.unit else ""

@@ -93,7 +93,7 @@ class PlaceObserver:
                 seen[j] = PairFeatures(pixels, descriptors, np.zeros((0, 2)), none)
                 continue
             frame = observer.observe(frameset.stamp_ns, (images[0], images[1]), pixels)
-            right, _ = observer.pair.right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
+            right, _ = observer.pair.right.project(np.column_stack([frame.right_rays, np.ones(len(pixels))]))
             seen[j] = PairFeatures(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
         return seen
 

@@ -111,7 +111,7 @@ def located(
         rows = rows[has_ray[rows[:, 0]] & seen[rows[:, 1]]]
         if not len(rows):
             continue
-        rays = frame.left[rows[:, 0]], then[rows[:, 1]]
+        rays = frame.left_rays[rows[:, 0]], then[rows[:, 1]]
         found, uncertain = _triangulated(camera, *rays, motion.place_T_neighbour)
         shifted = _shifts(camera, *rays, motion, found)
         variance = FEATURE_SIGMA_PX**2 * uncertain[:, 2, 2] + (shifted**2).sum(axis=0)

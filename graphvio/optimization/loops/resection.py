@@ -22,7 +22,7 @@ from graphvio.frontend.lucas_kanade import MIN_GRADIENT
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.refinement import Refined, refine
-from graphvio.frontend.selection import joint_motion_known_depths
+from graphvio.frontend.selection import searched_and_refined
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import FrameSet
@@ -75,7 +75,7 @@ def resect_features(
     if len(observations.pair) < settings.min_inliers:
         return None
     arrays = RigArrays.of(rig).crossed(crossings)
-    refined = joint_motion_known_depths(arrays, observations, np.eye(4), settings, np.random.default_rng(list(seed)))
+    refined = searched_and_refined(arrays, observations, np.eye(4), settings, np.random.default_rng(list(seed)))
     if not is_supported(refined.inlier, settings):
         return None
     found = _resection(refined, crossings, observations.pair, is_registered=False)
@@ -144,7 +144,7 @@ def register_patches(
         observations = correspondences.observations
         if len(observations.pair) < _MIN_REGISTERED:
             return best
-        refined = joint_motion_known_depths(
+        refined = searched_and_refined(
             rig, observations, best.cur_T_ref, config.motion, np.random.default_rng(list(seed))
         )
         if refined.inlier.sum() < _MIN_REGISTERED or not is_supported(refined.inlier, config.motion):
@@ -161,7 +161,7 @@ def _registered(
     left_T_left = camera.cam_T_body @ cur_T_ref @ camera.body_T_cam
     depth = np.where(known.has_depth, np.maximum(known.points[:, 2], 0.0), 0.0)
     guess, inverse_depths, valid = predict_pixels(
-        known.left, depth, left_T_left, camera.model_number, camera.intrinsics, camera.distortion
+        known.left_rays, depth, left_T_left, camera.model_number, camera.intrinsics, camera.distortion
     )
     rows = np.flatnonzero(valid & known.has_depth & camera.contains(guess, 8.0))
     pixels, at = patches.find(known.ids[rows], guess[rows], images[0], left_T_left, MIN_GRADIENT)
@@ -187,8 +187,8 @@ def _observations(
                 np.full(len(rows), number),
                 then.points[one],
                 then.covariances[one],
-                now.left[other],
-                np.where(right[:, None], now.right[other], 0.0),
+                now.left_rays[other],
+                np.where(right[:, None], now.right_rays[other], 0.0),
                 right,
             )
         )

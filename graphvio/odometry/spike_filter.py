@@ -19,7 +19,7 @@ _Change = tuple[float, float]  # of rate, rad/s, and force, m/s^2
 _NONE: _Change = (0.0, 0.0)
 
 
-class SpikeGuard:
+class SpikeFilter:
     """Passes IMU samples on; one that is far from the one before is held until the next one shows which is wrong.
 
     A spike is much farther from both neighbours than these are from each other, than the last three before it are from

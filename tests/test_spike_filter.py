@@ -13,8 +13,8 @@ from graphvio import FrameSet, ImuSample, Odometry, open_source
 from graphvio.arrays import Float
 from graphvio.evaluation import evaluate
 from graphvio.measurements.events import EventKind
-from graphvio.odometry import spike_guard
-from graphvio.odometry.spike_guard import SpikeGuard
+from graphvio.odometry import spike_filter
+from graphvio.odometry.spike_filter import SpikeFilter
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
@@ -31,12 +31,12 @@ def standing(n: int) -> Float:
     return np.asarray(noise + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
 
 
-def guarded(samples: list[ImuSample], step_ns: int = STEP_NS) -> tuple[list[int], list[int]]:
+def filtered(samples: list[ImuSample], step_ns: int = STEP_NS) -> tuple[list[int], list[int]]:
     """Return the stamps of the samples that pass, and of those that are left out, in steps."""
     left_out: list[int] = []
-    guard = SpikeGuard(lambda stamp_ns, kind, _: left_out.append(stamp_ns) if kind is EventKind.IMU_SPIKE else None)
-    passed = [each.stamp_ns for sample in samples for each in guard.confirm(sample)]
-    passed += [each.stamp_ns for each in guard.end()]
+    spikes = SpikeFilter(lambda stamp_ns, kind, _: left_out.append(stamp_ns) if kind is EventKind.IMU_SPIKE else None)
+    passed = [each.stamp_ns for sample in samples for each in spikes.confirm(sample)]
+    passed += [each.stamp_ns for each in spikes.end()]
     return [stamp // step_ns for stamp in passed], [stamp // step_ns for stamp in left_out]
 
 
@@ -44,7 +44,7 @@ def guarded(samples: list[ImuSample], step_ns: int = STEP_NS) -> tuple[list[int]
 def test_single_sample_far_from_its_neighbours_is_left_out(axis: int) -> None:
     readings = standing(80)
     readings[[40, 60], axis] += [3.0, -3.0]
-    passed, left_out = guarded(samples_of(readings))
+    passed, left_out = filtered(samples_of(readings))
     assert left_out == [40, 60]
     assert passed == [k for k in range(80) if k not in left_out]
 
@@ -52,15 +52,15 @@ def test_single_sample_far_from_its_neighbours_is_left_out(axis: int) -> None:
 def test_suspect_is_held_until_the_next_sample_and_passed_in_time_order() -> None:
     readings = standing(80)
     readings[50:, 3] += 5.0  # it goes on
-    guard = SpikeGuard(lambda *_: pytest.fail("no spike"))
-    passed = [[each.stamp_ns // STEP_NS for each in guard.confirm(sample)] for sample in samples_of(readings)]
+    spikes = SpikeFilter(lambda *_: pytest.fail("no spike"))
+    passed = [[each.stamp_ns // STEP_NS for each in spikes.confirm(sample)] for sample in samples_of(readings)]
     assert passed[49:53] == [[49], [], [50, 51], [52]]
 
 
 def test_spike_before_a_sample_that_no_sensor_reads_is_judged_by_the_next_one() -> None:
     readings, step_ns = standing(80), STEP_NS // 2
     readings[50, 3], readings[51, 0] = 5.0, np.nan
-    passed, left_out = guarded(samples_of(readings, step_ns), step_ns)
+    passed, left_out = filtered(samples_of(readings, step_ns), step_ns)
     assert left_out == [50]
     assert passed == [k for k in range(80) if k != 50]
 
@@ -68,14 +68,14 @@ def test_spike_before_a_sample_that_no_sensor_reads_is_judged_by_the_next_one() 
 def test_last_sample_is_passed_though_none_judges_it() -> None:
     readings = standing(80)
     readings[79, 3] = 5.0
-    assert guarded(samples_of(readings)) == (list(range(80)), [])
+    assert filtered(samples_of(readings)) == (list(range(80)), [])
 
 
 @pytest.mark.parametrize("rate_hz", [66.0, 80.0, 99.0, 99.9, 100.0])
 def test_sudden_vibration_passes(rate_hz: float) -> None:
     readings, times = standing(2000), 5e-3 * np.arange(2000)
     readings[100:, 3] += 8.0 * np.cos(2.0 * np.pi * rate_hz * times[100:])
-    passed, left_out = guarded(samples_of(readings))
+    passed, left_out = filtered(samples_of(readings))
     assert not left_out
     assert passed == list(range(2000))
 
@@ -87,14 +87,14 @@ def test_shocks_of_several_samples_pass(duration_ms: float) -> None:
     for k in range(35):
         phase = (times - (500.0 * k + 117.0 + 0.3 * k)) / duration_ms
         readings[:, 3] += np.where((phase > 0.0) & (phase < 1.0), 25.0 * np.sin(np.pi * phase), 0.0)
-    assert not guarded(samples_of(readings))[1]
+    assert not filtered(samples_of(readings))[1]
 
 
 @pytest.mark.parametrize("every", [2, 3, 4])
 def test_what_comes_often_is_measured(every: int) -> None:
     readings = standing(1000)
     readings[100::every, 3] += 5.0
-    left_out = guarded(samples_of(readings))[1]
+    left_out = filtered(samples_of(readings))[1]
     assert len(left_out) < 15
     assert max(left_out, default=0) < 200
 
@@ -102,7 +102,7 @@ def test_what_comes_often_is_measured(every: int) -> None:
 def test_shocks_of_one_sample_of_a_slow_imu_pass() -> None:
     readings, step_ns = standing(500), 20_000_000
     readings[50::50, 3] += 25.0
-    assert guarded(samples_of(readings, step_ns), step_ns) == (list(range(500)), [])
+    assert filtered(samples_of(readings, step_ns), step_ns) == (list(range(500)), [])
 
 
 def test_repeated_older_samples_judge_nothing() -> None:
@@ -110,7 +110,7 @@ def test_repeated_older_samples_judge_nothing() -> None:
     readings[50:, 3] += 5.0  # it goes on
     samples = samples_of(readings)
     for repeated in (45, 49, 50):  # after the step, and the step itself twice
-        passed, left_out = guarded([*samples[:51], samples[repeated], *samples[51:]])
+        passed, left_out = filtered([*samples[:51], samples[repeated], *samples[51:]])
         assert not left_out
         assert [k for k in passed if k not in (45, 49)] == [k for k in range(80) if k not in (45, 49)]
 
@@ -119,7 +119,7 @@ def test_samples_that_no_sensor_reads_are_left_to_others() -> None:
     readings = standing(80)
     readings[[0, 45, 46], 2] = np.nan
     readings[60, 5] = np.inf
-    passed, left_out = guarded(samples_of(readings))
+    passed, left_out = filtered(samples_of(readings))
     assert not left_out
     assert passed == list(range(80))
 
@@ -131,21 +131,21 @@ def test_sample_not_after_the_one_that_is_held_is_refused_by_its_kind(later_ns: 
     readings = standing(80)
     readings[50:, 3] += 5.0  # sample 50 is held
     samples, kinds = samples_of(readings), list[str]()
-    guard = SpikeGuard(lambda _, kind, __: kinds.append(kind))
+    spikes = SpikeFilter(lambda _, kind, __: kinds.append(kind))
     for sample in samples[:51]:
-        guard.confirm(sample)
-    assert guard.confirm(replace(samples[50], stamp_ns=50 * STEP_NS + later_ns)) == []
+        spikes.confirm(sample)
+    assert spikes.confirm(replace(samples[50], stamp_ns=50 * STEP_NS + later_ns)) == []
     assert kinds == [kind]
-    assert [each.stamp_ns for each in guard.confirm(samples[51])] == [50 * STEP_NS, 51 * STEP_NS]
+    assert [each.stamp_ns for each in spikes.confirm(samples[51])] == [50 * STEP_NS, 51 * STEP_NS]
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="the real recordings are not here")
 @pytest.mark.parametrize("recording", ["euroc_mh01_clip", "euroc_v101_imu"])
 def test_real_flights_have_no_spikes_with_half_the_limits(recording: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_OVER_MEAN", "_OVER_NEIGHBOURS", "_MIN_RATE", "_MIN_FORCE"):
-        monkeypatch.setattr(spike_guard, name, 0.5 * getattr(spike_guard, name))
+        monkeypatch.setattr(spike_filter, name, 0.5 * getattr(spike_filter, name))
     rows = np.genfromtxt(DATA / recording / "mav0" / "imu0" / "data.csv", delimiter=",", comments="#")
-    passed, left_out = guarded(samples_of(rows[:, 1:7]))
+    passed, left_out = filtered(samples_of(rows[:, 1:7]))
     assert not left_out
     assert len(passed) == len(rows)
 

@@ -1,0 +1,230 @@
+"""What the front-ends of all rigs do: track every pair and single camera, and keep the frames to measure from."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.config import Config
+from graphvio.frontend.extrinsic_monitor import ExtrinsicError
+from graphvio.frontend.extrinsics import RigExtrinsics
+from graphvio.frontend.frozen import Frozen, FrozenImages
+from graphvio.frontend.images import ImageMask
+from graphvio.frontend.motion_stereo import MotionHistory
+from graphvio.frontend.observations import Correspondences, correspond
+from graphvio.frontend.references import References
+from graphvio.frontend.rolling_shutter import ReadoutMotion
+from graphvio.frontend.standstill import Standstill
+from graphvio.frontend.thresholds import THRESHOLDS
+from graphvio.frontend.tracker import GroupTracker
+from graphvio.frontend.tracks import TrackedFrame
+from graphvio.geometry import se3_inverse
+from graphvio.measurements.motion import VisualResult
+from graphvio.measurements.sensors import FrameSet
+from graphvio.rig import Rig
+from graphvio.timing import timed
+
+MotionPredictor = Callable[[int], Float | None]
+"""Takes an earlier stamp and returns the predicted ``cur_T_then`` (4, 4) of body, or None if unknown."""
+
+_Result = TypeVar("_Result")
+
+
+class TrackedFrameset(NamedTuple):
+    """Tracks of a frameset.
+
+    Attributes:
+        stamp_ns: Stamp of the frameset.
+        frozen: Which images repeat.
+        frames: Pair index -> its tracks.
+        reference: Pair index -> its tracks at the reference; empty if there is none.
+        correspondences: Points of both.
+    """
+
+    stamp_ns: int
+    frozen: Frozen
+    frames: dict[int, TrackedFrame]
+    reference: dict[int, TrackedFrame]
+    correspondences: Correspondences
+
+    @property
+    def reference_stamp_ns(self) -> int:
+        """Stamp of the reference, if there is one."""
+        return next(iter(self.reference.values())).stamp_ns
+
+
+class TrackingFrontend(ABC):
+    """Tracks every pair and single camera, each in a thread of its own.
+
+    Args:
+        rig: Stereo pairs and single cameras.
+        config: Configuration of all stages.
+        image_mask: Masks of each image, or None.
+
+    Attributes:
+        stage_ms: Processing time by stage of the newest frameset, milliseconds.
+    """
+
+    def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
+        self.stage_ms: dict[str, float] = {}
+        self._config = config
+        self._rig = rig
+        self._extrinsics = RigExtrinsics(rig, config)
+        self._histories = [MotionHistory() for _ in rig.groups]  # of each, since they may be triggered by themselves
+        self._trackers = [
+            GroupTracker(group, config, history, image_mask)
+            for group, history in zip(rig.groups, self._histories, strict=True)
+        ]
+        self._frozen = FrozenImages()
+        self._all_frozen = False
+        self._latest: dict[int, TrackedFrame] = {}
+        self._references = References(config.motion)
+        self._standstill = Standstill()
+        self._has_rolling_shutter = any(camera.line_time_us for camera in rig.cameras)
+        self._workers = ThreadPoolExecutor(len(rig.groups), thread_name_prefix="graphvio-pair")
+
+    @abstractmethod
+    def process(
+        self,
+        frameset: FrameSet,
+        motion_since: MotionPredictor,
+        readout: ReadoutMotion | None = None,
+        rotation_since: MotionPredictor | None = None,
+    ) -> VisualResult:
+        """Track a frameset, and measure its motion where the cameras alone can.
+
+        Args:
+            frameset: Images of any subset of pairs and single cameras.
+            motion_since: The back-end's predicted motion since an earlier stamp, from which the search begins.
+            readout: Motion of body while rolling shutters read the images out; None continues that of the prediction.
+            rotation_since: The rotation by the gyro alone, from which the search begins where no motion is predicted.
+
+        Raises:
+            RigError: If an image does not fit the rig; nothing has changed then.
+        """
+
+    @property
+    def reference_stamps_ns(self) -> frozenset[int]:
+        """Stamps of the framesets that later motions will be measured from."""
+        return self._references.stamps_ns
+
+    @property
+    def body_T_left(self) -> Float:
+        """(P, 4, 4) of the groups' left cameras, with the corrections that are in force."""
+        return self._extrinsics.arrays.body_T_left
+
+    @property
+    def extrinsic_errors(self) -> Mapping[int, ExtrinsicError]:
+        """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
+        return self._extrinsics.extrinsic_errors
+
+    def frames_at(self, stamp_ns: int) -> dict[int, TrackedFrame]:
+        """Return the tracks of pairs and single cameras at the newest frameset, if it has this stamp."""
+        return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
+
+    def limit_corners(self, share: float) -> None:
+        """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for from now on."""
+        for tracker in self._trackers:
+            tracker.limit_corners(share)
+
+    def start_keyframe(self) -> None:
+        """Measure the next motions from the newest frameset."""
+        self._references.clear()
+        if not self._latest:
+            return  # no image has come yet
+        newest_ns = max(frame.stamp_ns for frame in self._latest.values())
+        self._refer_to({j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns})
+
+    def drop(self, outliers: Mapping[int, Int]) -> None:
+        """Drop tracks that do not stand still: index of the pair or camera -> identities."""
+        for j, ids in outliers.items():
+            self._trackers[j].drop(ids)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._workers.shutdown()
+
+    @timed("track")
+    def _track(
+        self,
+        frameset: FrameSet,
+        motion_since: MotionPredictor,
+        readout: ReadoutMotion | None,
+        rotation_since: MotionPredictor | None,
+    ) -> TrackedFrameset:
+        """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
+        frozen = self._frozen.update(frameset)
+        self._all_frozen = frozen.all_since_ns is not None
+        oldest_ns = frameset.stamp_ns - THRESHOLDS.reference.max_absence_ns
+        for j in [j for j, frame in self._latest.items() if frame.stamp_ns < oldest_ns]:
+            self._trackers[j].drop(self._latest.pop(j).ids)
+            self._references.forget(j)
+
+        if readout is None and self._has_rolling_shutter:
+            readout = self._steady_readout(frameset.stamp_ns, motion_since)
+
+        def observe(j: int) -> TrackedFrame:
+            since_latest = self._predicted(j, self._latest.get(j), motion_since)
+            if since_latest is None and rotation_since is not None:
+                since_latest = self._predicted(j, self._latest.get(j), rotation_since)
+            since_reference = self._predicted(j, self._references.of(j), motion_since)
+            left, *right = frameset.images[j]
+            masks = frameset.masks.get(j, (None, None))
+            return self._trackers[j].observe(
+                frameset.stamp_ns, left, right[0] if right else None, since_latest, since_reference, masks, readout
+            )
+
+        frames = self._in_parallel(observe, frameset.images.keys() - frozen.pairs)
+        self._latest.update(frames)
+        for stage in ("pyramid", "register", "flow", "stereo"):
+            self.stage_ms[stage] = max((frame.stage_ms[stage] for frame in frames.values()), default=0.0)
+        reference = self._references.shared(frames)
+        return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
+
+    def _in_parallel(self, work: Callable[[int], _Result], pairs: Iterable[int]) -> dict[int, _Result]:
+        """Work on each pair, all but the first in threads of their own."""
+        ordered = sorted(pairs)
+        others = [(j, self._workers.submit(work, j)) for j in ordered[1:]]
+        frames = {j: work(j) for j in ordered[:1]}
+        return frames | {j: other.result() for j, other in others}
+
+    def _predicted(self, pair: int, then: TrackedFrame | None, motion_since: MotionPredictor) -> Float | None:
+        """Predict the motion of points in a pair's left camera since one of its frames."""
+        return None if then is None else self._moved(pair, motion_since(then.stamp_ns))
+
+    def _moved(self, pair: int, cur_T_then: Float | None) -> Float | None:
+        """Return the motion of points in a pair's left camera for one of body, by eq. (1)."""
+        if cur_T_then is None:
+            return None
+        body_T_left = self._extrinsics.arrays.body_T_left[pair]
+        return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
+
+    def _steady_readout(self, stamp_ns: int, motion_since: MotionPredictor) -> ReadoutMotion | None:
+        """Continue the predicted motion since the images before, or return None where there is none."""
+        before_ns = max((frame.stamp_ns for frame in self._latest.values()), default=stamp_ns)
+        cur_T_before = motion_since(before_ns) if before_ns < stamp_ns else None
+        return None if cur_T_before is None else ReadoutMotion.steady(cur_T_before, 1e-9 * (stamp_ns - before_ns))
+
+    def _refer_to(self, frames: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:
+        """Measure the next motions from the newest frames of some pairs, and add corners to their tracks.
+
+        Images that all repeat are of an earlier instant than their stamp: nothing is measured from them.
+        """
+        if self._all_frozen:
+            return dict(frames)
+        newest_ns = max((frame.stamp_ns for frame in frames.values()), default=None)
+        for j in frames:
+            if newest_ns is not None and newest_ns != self._histories[j].newest_ns:
+                self._histories[j].restart(newest_ns)
+        replenished = self._in_parallel(lambda j: self._trackers[j].replenish(), frames)
+        self._latest.update(replenished)
+        self._references.replace(replenished)
+        if self._config.motion.reference == "keyframe":
+            for j in replenished:
+                self._trackers[j].keep_keyframe_patches()
+        return replenished
