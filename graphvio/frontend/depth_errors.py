@@ -34,8 +34,8 @@ def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cu
 
     Returns:
         (P, 2, 6) with respect to an offset of all inverse depths of a pair, 1/m, and to a share of them; tangent
-        ``[rotation, translation]`` in the body frame at the current instant. Zero for single cameras and pairs without
-        points.
+        ``[rotation, translation]`` of ``cur_T_ref`` in the body frame at the current instant, so the opposite of
+        what the pose there does. Zero for single cameras and pairs without points.
     """
     n_pairs, motions = len(rig.focal_px), camera_motions(cur_T_ref, rig)
     information, derivatives = np.eye(6) / _WEAKEST_SIGMA**2, np.zeros((n_pairs, 2, 6))

@@ -65,8 +65,8 @@ class RelativeMotion:
         shared_covariance: (6, 6) the part of it that all motions from this reference have in common, same tangent.
         inliers: Number of points that it explains.
         by_depth_errors: (P, 2, 6) derivatives with respect to an offset of all inverse depths of a pair, 1/m, and to a
-            share of them, same tangent; zero for pairs that did not measure it. None where errors of pairs are not
-            estimated.
+            share of them, in the opposite direction of the same tangent: what the reference does, seen from body now.
+            Zero for pairs that did not measure it, None where errors of pairs are not estimated.
         calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
             where they add nothing. Innovation tests allow for it.
         pairs: Of one of several hypotheses, indices of the pairs and single cameras whose motion it is.

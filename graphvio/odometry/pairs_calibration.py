@@ -14,7 +14,7 @@ from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import so3_log
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import CORRECTED, EventKind, Report
-from graphvio.measurements.motion import Quality, VisualResult
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.odometry.assembly import views_at
 from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
@@ -69,6 +69,7 @@ class PairsCalibration:
         self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()  # pairs
         self._calibration = SelfCalibration(rig)
+        self._motion: RelativeMotion | None = None  # by vision, of the newest frameset
         self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
         self._in_force = np.zeros_like(self.estimate.difference)  # of the calibration from the rig file
@@ -103,15 +104,21 @@ class PairsCalibration:
 
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
         """Attach to each motion the innovation covariance that errors of the calibration add."""
+        self._motion = visual.motion
         if self._innovation_covariance is None:
             return visual
         return self._innovation_covariance.with_calibration_covariance(visual, self._estimator)
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
         """Add a frameset as a candidate for a keyframe, where its pose is of use."""
-        calibration, estimator = self._calibration, self._estimator
+        calibration, estimator, references = self._calibration, self._estimator, self._frontend.reference_stamps_ns
+        instant_ns = self._synchroniser.instant_ns(stamp_ns)
+        if estimator.epoch != self._epoch:
+            self._epoch = estimator.epoch
+            calibration.start_window()
+        motion = self._motion if status in (Status.TRACKING, Status.INITIALISING) else None
+        calibration.add_motion(stamp_ns, instant_ns, estimator.state().nav_T_body, motion, references)
         if self._innovation_covariance is not None:
-            references = self._frontend.reference_stamps_ns
             self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.upper_covariance)
         is_urgent = self._frontend.are_lines_off
         # Until the calibration is trusted, motions may be refused because of it.
@@ -119,14 +126,10 @@ class PairsCalibration:
         is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
         if not (is_usable or is_urgent):
             return
-        if estimator.epoch != self._epoch:
-            self._epoch = estimator.epoch
-            calibration.start_window()
         views = views_at(self._frontend, stamp_ns)
         tolerant = self._imu_fault_tolerant
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)
-        instant_ns = self._synchroniser.instant_ns(stamp_ns)
         calibration.add_frameset(instant_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:

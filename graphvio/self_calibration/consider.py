@@ -15,7 +15,10 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse
+from graphvio.self_calibration.motion_gains import PoseGain
 from graphvio.self_calibration.window import Keyframe
+
+_GAIN_ERROR = 0.2  # of what a `PoseGain` says, in all directions: it is an approximation
 
 
 class ConsiderCovariance:
@@ -56,14 +59,24 @@ class ConsiderCovariance:
         self._before_knock = carried @ self._before_knock @ carried.T
         self._newest = newest
 
-    def set_calibration_in_force(self, difference: Float, covariance: Float) -> None:
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest keyframe of `extend`, or None."""
+        return None if self._newest is None else self._newest.stamp_ns
+
+    def set_calibration_in_force(self, difference: Float, covariance: Float, since: PoseGain | None = None) -> None:
         """Set the calibration that is in force from now on.
 
         Args:
             difference: (N,) from the rig file.
             covariance: (N, N) of it.
+            since: how the newest pose depends on the calibration since `newest_ns`, or None if that is not known: the
+                motions until now were measured with the calibration before.
         """
-        self._left_behind = self._left_behind + self._gain @ (difference - self._difference)
+        gain = self._gain
+        if self._newest is not None and since is not None:
+            gain = gain + _adjoint(since.odom_T_body, self._newest.odom_T_body) @ since.by_cameras
+        self._left_behind = self._left_behind + gain @ (difference - self._difference)
         self._difference, self._covariance = difference, covariance
 
     def correct(self, change: Float) -> None:
@@ -75,18 +88,32 @@ class ConsiderCovariance:
         self._before_knock = self._at_newest
         self._gain, self._left_behind = np.zeros_like(self._gain), np.zeros(6)
 
-    def at(self, odom_T_body: Float) -> Float:
-        """Return the covariance (6, 6) that it adds to a pose (4, 4), which is not far from the newest keyframe."""
+    def at(self, odom_T_body: Float, since: PoseGain | None = None) -> Float:
+        """Return the covariance (6, 6) that it adds to a pose.
+
+        Args:
+            odom_T_body: (4, 4) pose, not far from the newest keyframe.
+            since: how it depends on the calibration since `newest_ns`, or None if that is not known.
+        """
         if self._newest is None:
             return np.zeros((6, 6))
-        carried = se3_adjoint(se3_inverse(odom_T_body) @ self._newest.odom_T_body)
-        return np.asarray(carried @ self._at_newest @ carried.T)
+        carried, by_error = _adjoint(self._newest.odom_T_body, odom_T_body), np.zeros((6, 6))
+        gain = carried @ self._gain
+        if since is not None:
+            added = _adjoint(since.odom_T_body, odom_T_body) @ since.by_cameras
+            variances = np.diag(added @ self._covariance @ added.T).reshape(2, 3).mean(axis=1)
+            gain, by_error = gain + added, np.diag(np.repeat(_GAIN_ERROR**2 * variances, 3))
+        return np.asarray(gain @ self._covariance @ gain.T + carried @ self._uncorrelated @ carried.T + by_error)
 
     @property
     def _at_newest(self) -> Float:
-        of_now = self._gain @ self._covariance @ self._gain.T
+        return np.asarray(self._gain @ self._covariance @ self._gain.T + self._uncorrelated)
+
+    @property
+    def _uncorrelated(self) -> Float:
+        """Covariance at the newest keyframe of what does not depend on the error of the calibration in force."""
         left_behind = np.outer(self._left_behind, self._left_behind) + _second_order(self._left_behind)
-        return np.asarray(of_now + left_behind + self._before_knock)
+        return np.asarray(left_behind + self._before_knock)
 
 
 def _second_order(error: Float) -> Float:
@@ -99,5 +126,10 @@ def _second_order(error: Float) -> Float:
 
 
 def _carried(then: Keyframe, now: Keyframe) -> Float:
-    """Return the matrix (6, 6) that turns an error of one pose into the error of a later one."""
-    return se3_adjoint(se3_inverse(now.odom_T_body) @ then.odom_T_body)
+    """Return the matrix (6, 6) that turns an error of one keyframe's pose into the error of a later one."""
+    return _adjoint(then.odom_T_body, now.odom_T_body)
+
+
+def _adjoint(then: Float, now: Float) -> Float:
+    """Return the matrix (6, 6) that turns an error of one pose (4, 4) into the error of a later one (4, 4)."""
+    return se3_adjoint(se3_inverse(now) @ then)

@@ -7,7 +7,7 @@ comes into force a fixed number of framesets after its adjustment began, so that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from graphvio.arrays import Float
 from graphvio.errors import RigError
 from graphvio.kernels import await_compilers
 from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
@@ -34,6 +35,7 @@ from graphvio.self_calibration.evidence import (
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
+from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
 from graphvio.self_calibration.pixel_noise import pixel_noise
 from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
@@ -124,6 +126,7 @@ class SelfCalibration:
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
         self._consider = ConsiderCovariance(self._n_camera_parameters)
+        self._gains = MotionGains(rig)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="graphvio-calibration")
 
     def close(self) -> None:
@@ -141,6 +144,12 @@ class SelfCalibration:
     def note_stamps(self, sigma_s: float) -> None:
         """Take the standard deviation of the framesets' stamps, seconds, as it is known now."""
         self._collector.stamp_sigma_s = sigma_s
+
+    def add_motion(
+        self, stamp_ns: int, instant_ns: int, odom_T_body: Float, motion: RelativeMotion | None, references: Set[int]
+    ) -> None:
+        """Add the motion of a frameset, before `add_frameset`; for arguments see `MotionGains.add`."""
+        self._gains.add(stamp_ns, instant_ns, odom_T_body, motion, references)
 
     def add_frameset(
         self,
@@ -171,27 +180,28 @@ class SelfCalibration:
                 return
         self._agreeing += not are_contradicting
         self._collector.add(stamp_ns, odom_T_body, views)
+        self._gains.note_keyframe()
         if is_urgent:
             self._adjust_when_due()
             self._due_in = 0
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
         """Return the covariance (6, 6) that errors of the calibration add to the newest pose (4, 4)."""
-        return self._consider.at(odom_T_body)
+        return self._consider.at(odom_T_body, self._since_newest())
 
     def correct_pose(self, turned: Float) -> None:
         """Take note that the newest pose has been changed by a tangent (6,) in body, as the calibration asked for."""
         self._consider.correct(turned)
 
     def start_window(self) -> None:
-        """Discard the window that is not full: the poses that come are in another frame, or their clock is another."""
-        self._collector.restart()
-        self._adjusted_at = 0
+        """Discard the window that is not full: the poses that come are in another frame."""
+        self._gains.restart()
+        self._discard_window()
 
     def restart_imu(self) -> None:
         """Discard all that has IMU samples of before: those that come are of another clock."""
         self._drop_pending()
-        self.start_window()
+        self._discard_window()
         self._collector.forget_samples()
 
     def update(self) -> bool:
@@ -263,10 +273,20 @@ class SelfCalibration:
         ):
             self._sigma_px = pixel_noise(solution.errors2, self._sigma_px)
         self._consider.extend(adjusted.window, adjusted.by_cameras)
-        self._consider.set_calibration_in_force(adjusted.estimate.difference[:n], adjusted.covariance)
+        difference = adjusted.estimate.difference[:n]
+        self._consider.set_calibration_in_force(difference, adjusted.covariance, self._since_newest())
         self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
         self.upper_covariance = adjusted.upper_covariance
-        self._in_force = self._nominal.moved(self.estimate.difference[:n])
+        self._in_force = self._nominal.moved(difference)
+
+    def _discard_window(self) -> None:
+        self._collector.restart()
+        self._adjusted_at = 0
+
+    def _since_newest(self) -> PoseGain | None:
+        """Return how the newest pose depends on the calibration since the keyframe that was adjusted last."""
+        newest_ns = self._consider.newest_ns
+        return None if newest_ns is None else self._gains.since(newest_ns)
 
     def _refuse(self, is_full: bool) -> None:
         """Discard a window that contradicts those before it; several such windows are a knock."""
