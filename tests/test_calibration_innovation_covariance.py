@@ -162,6 +162,24 @@ def test_calibration_covariance_after_recalibration_is_for_the_whole_way() -> No
     assert np.trace(walk.step(BOTH)) > 10.0 * np.trace(before)
 
 
+def test_calibration_covariance_from_a_new_reference_has_the_error_of_the_velocity() -> None:
+    """The motion itself is too short to be wrong, and the prediction continues what the motions before have shown."""
+    walk, errors = Walk(), InnovationErrors(COVARIANCE, default_rig())
+    for _ in range(8):
+        walk.step(BOTH)
+    walk.innovation_covariance.recalibrate(np.zeros(2 * PAIR))
+    newest_ns, now_ns = max(walk.estimator.poses), walk.estimator.move(is_accepted=True)
+    since = walk.estimator.motion_since(newest_ns)
+    assert since is not None
+    nothing = np.zeros_like(BY_DEPTH)
+    motion = RelativeMotion(newest_ns, now_ns, se3_inverse(since), np.eye(6), np.zeros((6, 6)), 100, nothing)
+    visual = VisualResult(motion, Quality.GOOD, "", {})
+    found = walk.innovation_covariance.with_calibration_covariance(visual, walk.estimator).motion
+    assert found is not None
+    assert found.calibration_covariance is not None
+    assert np.trace(found.calibration_covariance) > 0.9 * np.trace(errors.of_depths(BY_DEPTH))
+
+
 def test_recalibration_by_more_than_the_noise_of_motions_is_a_jump() -> None:
     walk, change = Walk(), np.zeros(2 * PAIR)
     walk.step(BOTH)

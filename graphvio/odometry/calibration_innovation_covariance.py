@@ -31,6 +31,13 @@ class _Measured(NamedTuple):
         return self.motion.reference_stamp_ns == motion.reference_stamp_ns
 
 
+class _VelocityError(NamedTuple):
+    """What errors of depths do to the state's velocity: its derivatives (P, 2, 6) and the errors then."""
+
+    by_depths: Float
+    errors: InnovationErrors
+
+
 class CalibrationInnovationCovariance:
     """Adds to motions by vision the covariance by which errors of the calibration make them contradict the IMU.
 
@@ -50,6 +57,7 @@ class CalibrationInnovationCovariance:
         self._followed_ns = -1  # the newest frameset whose motion passed the test
         self._followed: _Measured | None = None  # that motion
         self._tested: _Measured | None = None  # the newest one
+        self._followed_velocity: _VelocityError | None = None  # of the state, since that motion
         self._tested_by: dict[frozenset[int], RelativeMotion] = {}  # the newest one of each set of pairs
         self._velocity: Float | None = None  # (6,) of body at the newest frameset
         self._velocities: dict[int, Float | None] = {}
@@ -66,8 +74,10 @@ class CalibrationInnovationCovariance:
         """
         if self._covariance is not covariance:
             self._covariance, self._errors = covariance, InnovationErrors(covariance, self._rig)
+        assert self._errors is not None
         gate_result = estimator.gate_results.get("vision")
         if gate_result is not None and gate_result.accepted:
+            self._note_velocity(stamp_ns, estimator, self._errors)
             self._followed_ns, self._followed = stamp_ns, self._tested
         if self._tested is not None:
             self._tested_by[self._tested.pairs] = self._tested.motion
@@ -78,6 +88,18 @@ class CalibrationInnovationCovariance:
         self._velocities = {ns: each for ns, each in self._velocities.items() if ns in kept}
         self._velocities[stamp_ns] = self._velocity
         self._velocity = _body_velocity(estimator)
+
+    def _note_velocity(self, stamp_ns: int, estimator: StateEstimator, errors: InnovationErrors) -> None:
+        """Record what errors of depths do to the velocity, as two motions from the same reference have shown it."""
+        before, now = self._followed, self._tested
+        if before is None or now is None or not before.has_reference_of(now.motion):
+            return
+        now_T_before = estimator.motion_since(self._followed_ns)
+        if before.motion.by_depth_errors is None or now.motion.by_depth_errors is None or now_T_before is None:
+            return
+        carried = before.motion.by_depth_errors @ se3_adjoint(now_T_before).T
+        by_depths = (now.motion.by_depth_errors - carried) / (1e-9 * (stamp_ns - self._followed_ns))
+        self._followed_velocity = _VelocityError(by_depths, errors)
 
     def recalibrate(self, change: Float) -> bool:
         """Account for another calibration that motions are measured with from now on.
@@ -133,6 +155,11 @@ class CalibrationInnovationCovariance:
             ):
                 by_depth_errors = by_depth_errors - followed.motion.by_depth_errors @ se3_adjoint(now_T_since).T
             added = added + self._errors.of_depths(by_depth_errors)
+            velocity = self._followed_velocity
+            if velocity is not None and (followed is None or not followed.has_reference_of(motion)):
+                # The prediction goes on with a velocity that another calibration, or another reference, has measured.
+                step_s = (motion.stamp_ns - since_ns) * 1e-9
+                added = added + velocity.errors.of_depths(step_s * velocity.by_depths)
         if followed is not None and followed.pairs != pairs:
             for j in followed.pairs ^ pairs:
                 added = added + self._errors.of_other_extrinsics(j, motion.reference_T_current)
