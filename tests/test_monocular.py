@@ -269,6 +269,22 @@ def _still_interval() -> dict[str, object]:
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(("still_at_ns", "is_used"), [(500_000_000, True), (2_000_000_000, False)])
+def test_standstill_by_the_imu_is_used_if_images_soon_show_it(still_at_ns: int, is_used: bool) -> None:
+    """A steady turn looks like a gyro's bias."""
+    estimator, rate = MonocularEstimator(single_rig(), Config(), lambda *_: None), np.array([0.0, 0.0, 0.02])
+    turning = _still_interval() | {"angular_velocity": np.tile(rate, (100, 1)), "mean_rate": rate}
+    estimator.initialise(0, (SimpleNamespace(**turning), 0.0))  # type: ignore[arg-type]
+    for sample_ns in range(0, still_at_ns + 2 * IMU_NS, IMU_NS):
+        estimator.add_sample(sample_ns, np.array([*rate, 0.0, 0.0, GRAVITY_M_S2]))
+    for stamp_ns in range(FRAME_NS, still_at_ns + 1, FRAME_NS):
+        estimator.predict(stamp_ns, None)
+        assert not estimator._initialiser._gyro_bias.any()
+        visual = SimpleNamespace(camera_tracks={})
+        estimator.apply(visual, is_stationary=stamp_ns == still_at_ns)  # type: ignore[arg-type]
+    assert estimator._initialiser._gyro_bias.any() == is_used
+
+
 def aligned(flown: Flown) -> tuple[float, float]:
     """Return the rmse after alignment without scale, m, and the scale that would fit best."""
     estimate, truth = flown.poses[:, :3, 3], flown.truth[:, :3, 3]

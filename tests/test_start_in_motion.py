@@ -27,8 +27,8 @@ BASE_NS = 10_000_000_000
 class Swing:
     """A rig that swings in all directions about a steady course, tilted by some ten degrees."""
 
-    def __init__(self, rng: np.random.Generator, accel_m_s2: float, hertz: float) -> None:
-        self._rng = rng
+    def __init__(self, rng: np.random.Generator, accel_m_s2: float, hertz: float, turn_rad: float = 0.5) -> None:
+        self._rng, self._turn_rad = rng, turn_rad
         self._w = 2.0 * np.pi * hertz * rng.uniform(0.7, 1.3, 3)
         self._amplitude = accel_m_s2 / (2.0 * np.pi * hertz) ** 2 * rng.uniform(0.5, 1.0, 3)
         self._phase, self._turn_phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
@@ -36,7 +36,7 @@ class Swing:
         self.gyro_bias, self.accel_bias = 0.01 * rng.standard_normal(3), 0.1 * rng.standard_normal(3)
 
     def pose(self, t: float) -> Float:
-        rotation = so3_exp(0.5 * np.sin(1.5 * t + self._turn_phase) + self._tilt)
+        rotation = so3_exp(self._turn_rad * np.sin(1.5 * t + self._turn_phase) + self._tilt)
         return np.asarray(se3(rotation, self._amplitude * np.sin(self._w * t + self._phase) + self._course * t))
 
     def velocity(self, t: float) -> Float:
@@ -91,6 +91,7 @@ def run(
     duration_s: float = 4.0,
     bias_error: Float | None = None,
     with_imu: bool = True,
+    turn_rad: float = 0.5,
 ) -> Outcome:
     """Vision has these errors, one sigma, or sees nothing; the gyro's bias may be thought to be known, and be wrong."""
     rng, rig, config = np.random.default_rng(seed), default_rig(), Config()
@@ -98,7 +99,8 @@ def run(
     assert imu is not None
     if not with_imu:
         rig = rig.without_imu()
-    swing, synchroniser, out = Swing(rng, accel_m_s2, hertz), Synchroniser(rig, config, lambda *_: None), Outcome()
+    swing, out = Swing(rng, accel_m_s2, hertz, turn_rad), Outcome()
+    synchroniser = Synchroniser(rig, config, lambda *_: None)
     for k in range(-round(imu.rate_hz), round((duration_s + 0.1) * imu.rate_hz)):
         sample = swing.sample(k / imu.rate_hz, imu)
         if with_imu:
@@ -217,6 +219,15 @@ def test_initialisation_that_lacks_something_is_reported_once() -> None:
     ((reported_s, _, detail),) = [event for event in out.events if event[1] == "not_initialised"]
     assert reported_s == pytest.approx(2.05, abs=0.01)
     assert "velocity" in detail
+
+
+def test_steady_course_that_the_imu_takes_for_a_standstill_is_known_after_some_motions() -> None:
+    for seed in range(4):
+        out = run(seed, 0.0, 0.5, duration_s=2.0, turn_rad=0.0)
+        assert out.speed_m_s[0] > 0.5
+        assert max(out.speed_m_s[6:]) < 0.1
+        assert [kind for _, kind, _ in out.events].count("gate_reset") == 1
+        assert max(out.step_m[6:]) < 0.01
 
 
 def test_what_is_wrong_and_taken_for_known_is_given_up() -> None:

@@ -36,6 +36,7 @@ from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion,
 from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
+_MIN_AGAINST_STANDSTILL = 3  # refused motions
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
@@ -66,6 +67,7 @@ class SmootherEstimator:
         self._imu_failed = False  # samples were missing after the first rejected motion
         self._is_distrusted = False  # the IMU's calibration changed after the first rejected motion
         self._is_imu_left_out = False
+        self._is_standstill_assumed = False  # by the IMU alone, which does not see a steady motion
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
         self._sigma_m = 0.0  # of the position since vision last constrained it
         self._rebuilt_sigma_m = 0.0  # the same when the window was rebuilt since then
@@ -148,6 +150,7 @@ class SmootherEstimator:
         self._smoother = Smoother(self._config.smoother, self._rig.imu if imu else None)
         initial = first_state_at(stamp_ns, position, imu, self._rig, self._config.initialisation)
         self._initialise_at(with_free_gravity(initial) if imu else initial)
+        self._is_standstill_assumed = imu is not None and initial.is_known
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Extend the window by the IMU, or by constant velocity; a gap that neither bridges ends the epoch."""
@@ -257,7 +260,7 @@ class SmootherEstimator:
             return self._accept(motion)
         why = gate_result.exceedance if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
-        if visual.quality is not Quality.GOOD:
+        if visual.quality is not Quality.GOOD and not self._may_be_moving:
             return MeasurementUpdate(None)  # vision that contradicts itself cannot refute the prediction
         return self._refuse(motion)
 
@@ -279,6 +282,10 @@ class SmootherEstimator:
     def _refuse(self, motion: RelativeMotion) -> MeasurementUpdate:
         """Leave a motion of good quality out; reinitialise from vision once it has been refused for too long."""
         self._add_refused(motion)
+        if self._may_be_moving and len(self._refused) >= _MIN_AGAINST_STANDSTILL:
+            self._is_distrusted = True
+            self._reinitialise_from_vision(motion, "it moved steadily as it was initialised, and did not stand still")
+            return MeasurementUpdate(motion, needs_keyframe=True)
         if self._is_distrusted:
             self._reinitialise_from_vision(motion, "the IMU was corrected wrongly while vision was refused")
             return MeasurementUpdate(motion, needs_keyframe=True)
@@ -388,6 +395,7 @@ class SmootherEstimator:
 
     def _initialise_at(self, initial: InitialState) -> None:
         self._accepted = 0
+        self._is_standstill_assumed = False
         self._running.initialise(initial.stamp_ns, initial.state, initial.uncertainty)
         self._reset_ns = initial.stamp_ns
         self.initialisations += 1
@@ -401,6 +409,11 @@ class SmootherEstimator:
         self._refused.clear()
         self._imu_failed = self._is_distrusted = False
         self._status.is_lost = False
+
+    @property
+    def _may_be_moving(self) -> bool:
+        """Whether a standstill was assumed a moment ago, and images may show that it was none."""
+        return self._is_standstill_assumed and self._accepted < _MIN_TRUSTED_MOTIONS
 
     @property
     def _running(self) -> Smoother:

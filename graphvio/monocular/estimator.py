@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
-from graphvio.backend.initialisation import initial_attitude
+from graphvio.backend.initialisation import InitialAttitude, initial_attitude
 from graphvio.backend.states import RigState, StateCovariance
 from graphvio.config import Config
 from graphvio.geometry import se3, se3_inverse
@@ -36,6 +36,7 @@ from graphvio.self_calibration.estimate import CalibrationEstimate
 _MAX_CONTRADICTION_NS = 1_000_000_000
 _MAX_STAMP_SIGMA_S = 3e-4  # beyond which a window's errors are those of stamps, and not of the calibration
 _MAX_IMU_ERROR2 = 150.0
+_MAX_STANDSTILL_NS = 1_000_000_000  # from the initialisation until images show it
 _REPORT_AFTER_NS = 5_000_000_000
 _TURNS_OTHERWISE = "the IMU turns otherwise than the cameras"
 
@@ -73,6 +74,7 @@ class MonocularEstimator:
         self._before: tuple[int, Float] | None = None  # the state before the newest one, where it has left the window
         self._camera_tracks: dict[int, CameraTracks] = {}
         self._is_stationary = False
+        self._standstill: InitialAttitude | None = None  # that the IMU shows at the first frameset
         self._tracked_sigma_m = 0.0
         self._contradicted_since_ns: int | None = None
         self._rate: Float | None = None
@@ -180,9 +182,7 @@ class MonocularEstimator:
         self._latest_ns = self._since_ns = stamp_ns
         if imu is not None:
             attitude = initial_attitude(*imu, self._config.initialisation)
-            if attitude.is_stationary:
-                self._initialiser.set_gyro_bias_prior(attitude.gyro_bias, attitude.gyro_bias_sigma)
-                self._trust.set_gyro_bias_prior(attitude.gyro_bias, attitude.gyro_bias_sigma)
+            self._standstill = attitude if attitude.is_stationary else None
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Add a state by the IMU; where that has been silent for 5 s, the epoch ends."""
@@ -216,7 +216,16 @@ class MonocularEstimator:
         self._has_overlaps |= shared_points(visual.camera_tracks) > 0
         seen = dict(visual.camera_tracks) if self._are_trusted else alone(visual.camera_tracks)
         self._camera_tracks, self._is_stationary = seen, is_stationary
+        if is_stationary:
+            self._use_standstill()
         return MeasurementUpdate(None)
+
+    def _use_standstill(self) -> None:
+        """Set the gyro's bias by the standstill that the IMU showed, once images show it: a steady turn looks alike."""
+        standstill, self._standstill = self._standstill, None
+        if standstill is not None and self._latest_ns - self._since_ns <= _MAX_STANDSTILL_NS:
+            self._initialiser.set_gyro_bias_prior(standstill.gyro_bias, standstill.gyro_bias_sigma)
+            self._trust.set_gyro_bias_prior(standstill.gyro_bias, standstill.gyro_bias_sigma)
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
         """Solve the window, or look for the scale."""
@@ -332,7 +341,7 @@ class MonocularEstimator:
                 self._calibration.keep()
             self.epoch += 1
             self._report(stamp_ns, EventKind.LOST, why)
-        self._window, self._before, self._contradicted_since_ns = None, None, None
+        self._window, self._before, self._contradicted_since_ns, self._standstill = None, None, None, None
         self._solver.forget()
         self._collect_keyframes()
         self._since_ns, self._is_reported = stamp_ns, False
