@@ -36,7 +36,7 @@ from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion,
 from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
-_MIN_AGAINST_STANDSTILL = 3  # refused motions
+_MIN_AGAINST_STANDSTILL = 3  # rejected motions, soon after an initialisation at a standstill
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
@@ -65,7 +65,9 @@ class SmootherEstimator:
         self._accepted = 0  # motions since the initialisation
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._imu_failed = False  # samples were missing after the first rejected motion
-        self._is_distrusted = False  # the IMU's calibration changed after the first rejected motion
+        self._is_distrusted = (
+            False  # since the first rejected motion, the IMU's calibration or the initial state is wrong
+        )
         self._is_imu_left_out = False
         self._is_standstill_assumed = False  # by the IMU alone, which does not see a steady motion
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
@@ -261,7 +263,8 @@ class SmootherEstimator:
         why = gate_result.exceedance if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
         if visual.quality is not Quality.GOOD and not self._may_be_moving:
-            return MeasurementUpdate(None)  # vision that contradicts itself cannot refute the prediction
+            # Vision that contradicts itself cannot refute the prediction, but for a standstill that is only assumed.
+            return MeasurementUpdate(None)
         return self._refuse(motion)
 
     def _accept(self, motion: RelativeMotion) -> MeasurementUpdate:
@@ -280,19 +283,18 @@ class SmootherEstimator:
         return MeasurementUpdate(motion, needs_keyframe=True)
 
     def _refuse(self, motion: RelativeMotion) -> MeasurementUpdate:
-        """Leave a motion of good quality out; reinitialise from vision once it has been refused for too long."""
+        """Leave a motion out, or reinitialise from vision where the prediction has proved to be wrong."""
         self._add_refused(motion)
         if self._may_be_moving and len(self._refused) >= _MIN_AGAINST_STANDSTILL:
-            self._is_distrusted = True
-            self._reinitialise_from_vision(motion, "it moved steadily as it was initialised, and did not stand still")
-            return MeasurementUpdate(motion, needs_keyframe=True)
-        if self._is_distrusted:
-            self._reinitialise_from_vision(motion, "the IMU was corrected wrongly while vision was refused")
-            return MeasurementUpdate(motion, needs_keyframe=True)
-        if motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
-            self._reinitialise_from_vision(motion, "refused for too long")
-            return MeasurementUpdate(motion, needs_keyframe=True)
-        return MeasurementUpdate(None)
+            self._is_distrusted, why = True, "it was initialised in a steady motion, as at a standstill"
+        elif self._is_distrusted:
+            why = "the IMU was corrected wrongly while vision was refused"
+        elif motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
+            why = "refused for too long"
+        else:
+            return MeasurementUpdate(None)
+        self._reinitialise_from_vision(motion, why)
+        return MeasurementUpdate(motion, needs_keyframe=True)
 
     def _add_refused(self, motion: RelativeMotion) -> None:
         """Record the pose that a refused motion leads to, from a state or from the pose that earlier ones led to."""
