@@ -65,9 +65,7 @@ class SmootherEstimator:
         self._accepted = 0  # motions since the initialisation
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._imu_failed = False  # samples were missing after the first rejected motion
-        self._is_distrusted = (
-            False  # since the first rejected motion, the IMU's calibration or the initial state is wrong
-        )
+        self._is_distrusted = False  # calibration of the IMU or initial state proved to be wrong
         self._is_imu_left_out = False
         self._is_standstill_assumed = False  # by the IMU alone, which does not see a steady motion
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
