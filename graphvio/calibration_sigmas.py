@@ -24,8 +24,7 @@ class CalibrationSigmas:
         pair_rotation_deg: of each pair relative to the first one, about each axis.
         pair_translation_m: of each pair relative to the first one, each coordinate.
         time_offset_s: of the IMU's time offset.
-        imu_scale_share: of the scale of each axis of gyro and accelerometer; beside pairs, the accelerometer's axes may
-            also be off by as much in common.
+        imu_scale_share: of the scale of each axis of gyro and accelerometer.
         imu_misalignment_deg: of each axis of gyro and accelerometer.
 
     Raises:

@@ -106,7 +106,7 @@ def test_describe_compares_clocks_and_cameras_of_bags(kind: str, tmp_path: Path)
 
 
 def test_describe_of_no_session_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SessionError, match=r"is no session or bag; give NAME\.mcap, NAME\.bag or the folder"):
+    with pytest.raises(SessionError, match="is no session or bag"):
         describe(write_euroc(tmp_path / "walk", frames=2))
     with pytest.raises(SessionError, match="does not exist"):
         describe(tmp_path / "none.bag")

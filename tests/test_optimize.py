@@ -297,12 +297,12 @@ def test_optimize_wrong_file_is_calibrated_first(walk: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("without_plots")
-def test_optimize_refined_calibration_is_used_for_map(short_walk: Path, settings: Path, tmp_path: Path) -> None:
-    rig = open_source(short_walk).rig
+def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path, tmp_path: Path) -> None:
+    rig = open_source(walk).rig
     save_rig(with_wrong_place(rig, 1.0, 0.03), tmp_path / "wrong.yaml")
     out = tmp_path / "walk"
     refined = command(
-        short_walk, "--config", settings, "--rig", tmp_path / "wrong.yaml", "--refine-calibration", "--out", out
+        walk, "--config", settings, "--rig", tmp_path / "wrong.yaml", "--refine-calibration", "--out", out
     )
     assert refined.exit_code == 0, refined.output
     first = load_rig(out / "walk" / "rig-refined.yaml")

@@ -45,9 +45,7 @@ _CAMERAS, _EXTRINSICS, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors
 def file_prior(rig: Rig) -> FilePrior:
     """Return the prior of all parameters of a rig, of its cameras and its IMU, by its `CalibrationSigmas`.
 
-    Intrinsics and stereo extrinsics are one group, extrinsics in body and the IMU another one. Beside pairs, the
-    accelerometer's axes have an error of their scale in common besides that of each, as by a reference voltage: without
-    it, wrong baselines would explain such an error better. Of single cameras it would be the scale of the path.
+    Intrinsics and stereo extrinsics are one group, extrinsics in body and the IMU another one.
     """
     of_cameras = _covariance_of_cameras(rig)
     n = len(of_cameras)
@@ -59,12 +57,26 @@ def file_prior(rig: Rig) -> FilePrior:
     covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
     covariance[:n, :n] = of_cameras
     covariance[n:, n:] = np.diag(_sigmas_of_imu(rig.calibration_sigmas) ** 2)
-    if rig.pairs:
-        scales = slice(n + ACCEL_MATRIX, n + TIME_OFFSET, 4)
-        covariance[scales, scales] += rig.calibration_sigmas.imu_scale_share**2
     of_imu = np.full(PARAMETERS, _EXTRINSICS)
     of_imu[:GYRO_MATRIX] = _NO_GROUP
     return FilePrior(covariance, np.concatenate([group, of_imu]))
+
+
+def with_common_accelerometer_scale(prior: FilePrior, rig: Rig) -> FilePrior:
+    """Return a prior by which the accelerometer's axes have an error of their scale in common, besides that of each.
+
+    A reference voltage makes one. Without it, wrong baselines would explain what the first windows show of it better.
+
+    Args:
+        prior: of `file_prior`.
+        rig: with its sigmas; one without an IMU has the same prior.
+    """
+    if rig.imu is None:
+        return prior
+    covariance, n = prior.covariance.copy(), n_camera_parameters(rig)
+    scales = slice(n + ACCEL_MATRIX, n + TIME_OFFSET, 4)
+    covariance[scales, scales] += rig.calibration_sigmas.imu_scale_share**2
+    return prior._replace(covariance=covariance)
 
 
 def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
