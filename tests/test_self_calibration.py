@@ -25,7 +25,6 @@ from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landm
 from graphvio.self_calibration.collector import FullWindow, WindowCollector
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
-from graphvio.self_calibration.imu_model import ACCEL_MATRIX, PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector
 from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, new_scratch, observe
@@ -40,7 +39,7 @@ from graphvio.self_calibration.parameters import (
     has_coefficient,
     parameter_names,
 )
-from graphvio.self_calibration.prior import file_prior, with_common_accelerometer_scale
+from graphvio.self_calibration.prior import file_prior
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks
 from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
@@ -111,18 +110,6 @@ def test_file_prior_knows_each_coefficient_of_the_lens_and_keeps_those_it_does_n
     moved = RigCalibration.of(rig).moved(0.01 * sigmas).applied_to(rig)
     for one, other in zip(moved.cameras, rig.cameras, strict=True):
         np.testing.assert_array_equal(one.distortion[DISTORTION:], other.distortion[DISTORTION:])
-
-
-def test_prior_with_a_common_scale_of_the_accelerometer_changes_nothing_else() -> None:
-    rig = default_rig()
-    prior = file_prior(rig)
-    common = with_common_accelerometer_scale(prior, rig)
-    scales = len(prior.covariance) - PARAMETERS + ACCEL_MATRIX + np.array([0, 4, 8])
-    added = common.covariance - prior.covariance
-    np.testing.assert_allclose(added[np.ix_(scales, scales)], rig.calibration_sigmas.imu_scale_share**2)
-    assert np.count_nonzero(added) == 9
-    without = file_prior(rig.without_imu())
-    assert with_common_accelerometer_scale(without, rig.without_imu()) is without
 
 
 def test_eliminate_landmarks_gradient_equals_that_of_the_cost_over_all_unknowns() -> None:

@@ -38,12 +38,7 @@ from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
 from graphvio.self_calibration.pixel_noise import pixel_noise
-from graphvio.self_calibration.prior import (
-    extrinsic_covariances,
-    file_prior,
-    walk_per_second,
-    with_common_accelerometer_scale,
-)
+from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe, View
 
@@ -106,7 +101,7 @@ class SelfCalibration:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._nominal = RigCalibration.of(rig)
-        self._prior = with_common_accelerometer_scale(file_prior(rig), rig)
+        self._prior = file_prior(rig)
         upper_covariance = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
         self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(upper_covariance)))
         self._walk = walk_per_second(rig, self._prior, WALK)

@@ -62,23 +62,6 @@ def file_prior(rig: Rig) -> FilePrior:
     return FilePrior(covariance, np.concatenate([group, of_imu]))
 
 
-def with_common_accelerometer_scale(prior: FilePrior, rig: Rig) -> FilePrior:
-    """Return a prior by which the accelerometer's axes have an error of their scale in common, besides that of each.
-
-    A reference voltage makes one. Without it, wrong baselines would explain what the first windows show of it better.
-
-    Args:
-        prior: of `file_prior`.
-        rig: with its sigmas; one without an IMU has the same prior.
-    """
-    if rig.imu is None:
-        return prior
-    covariance, n = prior.covariance.copy(), n_camera_parameters(rig)
-    scales = slice(n + ACCEL_MATRIX, n + TIME_OFFSET, 4)
-    covariance[scales, scales] += rig.calibration_sigmas.imu_scale_share**2
-    return prior._replace(covariance=covariance)
-
-
 def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
     """Return the covariance (C, C) of what a calibration changes in one second, by heat and the like.
 
