@@ -75,6 +75,8 @@ def test_lasting_streams_stderr_reader_left_ends_nothing(monkeypatch: pytest.Mon
         with lasting_streams():
             print("a warning", file=sys.stderr, flush=True)
             print("another one", file=sys.stderr, flush=True)
+            assert isinstance(sys.stderr, LastingStream)
+            assert isinstance(sys.stderr.error, BrokenPipeError)
 
 
 def test_lasting_stream_failure_is_kept() -> None:

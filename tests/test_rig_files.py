@@ -280,7 +280,7 @@ def test_load_rig_baseline_in_millimetres_raises(tmp_path: Path) -> None:
     ],
 )
 def test_load_rig_unusual_but_possible_value_is_read(tmp_path: Path, key: str, value: object) -> None:
-    load_rig(edited(tmp_path, _set(key, value)))
+    assert load_rig(edited(tmp_path, _set(key, value))).pairs
 
 
 def test_load_rig_pair_without_baseline_or_common_view_raises(tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.geometry import se3_adjoint, se3_inverse
-from graphvio.self_calibration.motion_gains import PoseGain
+from graphvio.self_calibration.motion_gains import PoseGain, error_transport
 from graphvio.self_calibration.window import Keyframe
 
 _GAIN_ERROR = 0.2  # of what a `PoseGain` says, in all directions: it is an approximation
@@ -50,10 +49,11 @@ class ConsiderCovariance:
         newest = keyframes[-1]
         known = keyframes[0] if self._newest is None else self._newest
         first = next((k for k, keyframe in enumerate(keyframes) if keyframe.stamp_ns == known.stamp_ns), -1)
-        motion = by_cameras[-1] - _carried(keyframes[max(first, 0)], newest) @ by_cameras[max(first, 0)]
+        first_pose = keyframes[max(first, 0)].odom_T_body
+        motion = by_cameras[-1] - error_transport(first_pose, newest.odom_T_body) @ by_cameras[max(first, 0)]
         if first < 0 and len(keyframes) > 1:
             motion = motion * len(keyframes) / (len(keyframes) - 1)
-        carried = _carried(known, newest)
+        carried = error_transport(known.odom_T_body, newest.odom_T_body)
         self._gain = carried @ self._gain + motion
         self._left_behind = carried @ self._left_behind
         self._before_knock = carried @ self._before_knock @ carried.T
@@ -75,7 +75,7 @@ class ConsiderCovariance:
         """
         gain = self._gain
         if self._newest is not None and since is not None:
-            gain = gain + _adjoint(since.odom_T_body, self._newest.odom_T_body) @ since.by_cameras
+            gain = gain + error_transport(since.odom_T_body, self._newest.odom_T_body) @ since.by_cameras
         self._left_behind = self._left_behind + gain @ (difference - self._difference)
         self._difference, self._covariance = difference, covariance
 
@@ -97,10 +97,10 @@ class ConsiderCovariance:
         """
         if self._newest is None:
             return np.zeros((6, 6))
-        carried, by_error = _adjoint(self._newest.odom_T_body, odom_T_body), np.zeros((6, 6))
+        carried, by_error = error_transport(self._newest.odom_T_body, odom_T_body), np.zeros((6, 6))
         gain = carried @ self._gain
         if since is not None:
-            added = _adjoint(since.odom_T_body, odom_T_body) @ since.by_cameras
+            added = error_transport(since.odom_T_body, odom_T_body) @ since.by_cameras
             variances = np.diag(added @ self._covariance @ added.T).reshape(2, 3).mean(axis=1)
             gain, by_error = gain + added, np.diag(np.repeat(_GAIN_ERROR**2 * variances, 3))
         return np.asarray(gain @ self._covariance @ gain.T + carried @ self._uncorrelated @ carried.T + by_error)
@@ -123,13 +123,3 @@ def _second_order(error: Float) -> Float:
     """
     angle, distance = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     return np.diag(np.repeat([angle * angle, angle * distance], 3) ** 2)
-
-
-def _carried(then: Keyframe, now: Keyframe) -> Float:
-    """Return the matrix (6, 6) that turns an error of one keyframe's pose into the error of a later one."""
-    return _adjoint(then.odom_T_body, now.odom_T_body)
-
-
-def _adjoint(then: Float, now: Float) -> Float:
-    """Return the matrix (6, 6) that turns an error of one pose (4, 4) into the error of a later one (4, 4)."""
-    return se3_adjoint(se3_inverse(now) @ then)

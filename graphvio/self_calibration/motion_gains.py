@@ -82,7 +82,7 @@ class MotionGains:
         elif self._framesets:
             since = next(reversed(self._framesets.values()))
         if since is not None:
-            gain = _carried(since.pose, odom_T_body) @ since.pose.by_cameras + gain
+            gain = error_transport(since.pose.odom_T_body, odom_T_body) @ since.pose.by_cameras + gain
         self._forget(references)
         self._framesets[stamp_ns] = _Frameset(instant_ns, PoseGain(odom_T_body, gain))
 
@@ -97,7 +97,7 @@ class MotionGains:
         if then is None:
             return None
         newest = next(reversed(self._framesets.values())).pose
-        carried = _carried(then.pose, newest.odom_T_body)
+        carried = error_transport(then.pose.odom_T_body, newest.odom_T_body)
         gain = newest.by_cameras - carried @ then.pose.by_cameras
         gain[:, self._extrinsics] += (carried - np.eye(6)) @ self._about_origin
         return PoseGain(newest.odom_T_body, gain)
@@ -108,6 +108,6 @@ class MotionGains:
         self._framesets = {stamp_ns: each for stamp_ns, each in self._framesets.items() if stamp_ns in kept}
 
 
-def _carried(then: PoseGain, odom_T_body: Float) -> Float:
-    """Return the matrix (6, 6) that turns an error of one pose into the error of a later one."""
-    return se3_adjoint(se3_inverse(odom_T_body) @ then.odom_T_body)
+def error_transport(then: Float, now: Float) -> Float:
+    """Return the matrix (6, 6) that turns an error of one pose (4, 4) into the error of a later one (4, 4)."""
+    return se3_adjoint(se3_inverse(now) @ then)
