@@ -25,11 +25,14 @@ from graphvio import (
 from graphvio.arrays import Image
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import GraphWindow, WindowError
+from graphvio.evaluation import evaluate
 from graphvio.geometry import so3_log
 from graphvio.measurements.motion import Quality
-from graphvio.measurements.sensors import Measurement
+from graphvio.measurements.sensors import GRAVITY_M_S2, Measurement
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
+
+TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +42,7 @@ def measurements(room_walk: Path) -> list[Measurement]:
 
 @pytest.fixture(scope="module")
 def truth(room_walk: Path) -> Trajectory:
-    return load_trajectory(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
+    return load_trajectory(room_walk / TRUTH)
 
 
 @pytest.fixture
@@ -158,24 +161,42 @@ def test_framesets_before_the_imu_have_no_pose_and_start_nothing(
     assert kinds(odometry) == []
 
 
-def test_an_imu_that_comes_after_a_start_without_opens_an_epoch(
-    room_walk: Path, measurements: list[Measurement]
+@pytest.mark.parametrize(("estimator", "epochs"), [("smoother", {0}), ("filter", {0, 1})])
+def test_an_imu_that_comes_after_a_start_without_is_used(
+    long_room_walk: Path, estimator: str, epochs: set[int]
 ) -> None:
-    rig = open_source(room_walk).rig
-    config = Config.from_yaml("timing: {max_imu_start_wait_s: 0.5}")
-    first = framesets(measurements)[0].stamp_ns
-    late = Odometry(rig, config)
-    estimates = feed(late, [kept for e in measurements if (kept := _without_early_imu(e, first)) is not None])
+    source = open_source(long_room_walk, to_s=4.0)
+    config = Config.from_yaml(
+        f"{{timing: {{max_imu_start_wait_s: 0.5}}, fusion: {{estimator: {estimator}}}, motion: {{reference: "
+        f"{'keyframe' if estimator == 'smoother' else 'previous'}}}}}"
+    )
+    odometry = Odometry(source.rig, config)
+    early = [kept for e in source if (kept := _without_early_imu(e, source.start_ns, 2.0)) is not None]
+    estimates = feed(odometry, early)
     assert [e.nav_T_body is None for e in estimates] == [True] * 10 + [False] * (len(estimates) - 10)
-    assert [estimates[0].epoch, estimates[-1].epoch] == [0, 1]
-    assert kinds(late)[0] == "started_without_imu"
+    assert {e.epoch for e in estimates} == epochs
+    assert [kind for kind in kinds(odometry) if "imu" in kind] == ["started_without_imu", "imu_came"]
     assert estimates[-1].gyro_bias is not None
 
 
-def _without_early_imu(measurement: Measurement, first_ns: int) -> Measurement | None:
-    return (
-        None if isinstance(measurement, ImuSample) and measurement.stamp_ns < first_ns + 1_000_000_000 else measurement
-    )
+def test_an_imu_that_comes_in_motion_shows_gravity_and_moves_no_pose(long_room_walk: Path) -> None:
+    source, truth = open_source(long_room_walk, to_s=5.0), load_trajectory(long_room_walk / TRUTH)
+    odometry = Odometry(source.rig, Config.from_yaml("timing: {max_imu_start_wait_s: 0.5}"))
+    early = [kept for e in source if (kept := _without_early_imu(e, source.start_ns, 3.0)) is not None]
+    estimates = [e for e in feed(odometry, early) if e.nav_T_body is not None]
+    path = Trajectory(np.array([e.stamp_ns for e in estimates]), np.array([e.nav_T_body for e in estimates]))
+    assert evaluate(path, truth).ate_position_m.rmse < 0.003
+    last = estimates[-1]
+    assert last.nav_T_body is not None
+    assert last.gravity_nav is not None
+    down = last.nav_T_body[:3, :3].T @ last.gravity_nav
+    true_down = -GRAVITY_M_S2 * truth.nav_T_body[np.searchsorted(truth.stamps_ns, last.stamp_ns), 2, :3]
+    np.testing.assert_allclose(down, true_down, atol=0.1)
+
+
+def _without_early_imu(measurement: Measurement, first_ns: int, until_s: float = 1.0) -> Measurement | None:
+    is_early = isinstance(measurement, ImuSample) and measurement.stamp_ns < first_ns + until_s * 1e9
+    return None if is_early else measurement
 
 
 @pytest.mark.parametrize(

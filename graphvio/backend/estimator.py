@@ -185,6 +185,14 @@ class ImuFaultTolerant(Protocol):
             match: How the IMU moves beside vision.
         """
 
+    def use_late_imu(self, motion: RelativeMotion, imu: tuple[ImuInterval, float]) -> None:
+        """Use the IMU from now on, after an initialisation without: keep the newest pose, and take gravity from it.
+
+        Args:
+            motion: By vision, that ends in the newest state.
+            imu: The IMU around the state and the state's place in that interval, seconds.
+        """
+
     def distrust_prediction(self) -> None:
         """Record that the prediction is wrong and refused motions are right: the IMU's calibration was corrected.
 

@@ -184,6 +184,25 @@ def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covar
     return replace(initial, is_known=True)
 
 
+def with_late_imu(
+    initial: InitialState, motion: RelativeMotion, state: RigState, covariance: StateCovariance
+) -> InitialState:
+    """Reinitialise at the present pose for an IMU whose first samples have come only now.
+
+    Args:
+        initial: At the same instant by the IMU alone, in a nav frame that is level.
+        motion: By vision, that ends in the state.
+        state: The newest one.
+        covariance: Of that.
+    """
+    nav_R_level = state.nav_T_body[:3, :3] @ initial.state.nav_T_body[:3, :3].T
+    state = replace(_with_velocity(state, motion), gravity_nav=nav_R_level @ initial.state.gravity_nav)
+    uncertainty = InitialUncertainty(
+        initial.uncertainty.pose, _REINITIALISED_SPEED_SIGMA, _WIDE_GYRO_BIAS_SIGMA, covariance.pose
+    )
+    return with_free_gravity(InitialState(motion.stamp_ns, state, uncertainty))
+
+
 def with_wide_attitude(initial: InitialState) -> InitialState:
     """Return the first state of an epoch with gravity and gyro bias as uncertain as at a first initialisation.
 

@@ -20,6 +20,7 @@ from graphvio.backend.initial_state import (
     from_prediction,
     from_vision,
     with_free_gravity,
+    with_late_imu,
     with_new_imu,
     with_wide_attitude,
 )
@@ -138,17 +139,11 @@ class SmootherEstimator:
         """Do nothing: the intervals between framesets have the samples."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
-        """Make a smoother with one state, at the newest position if there is one, which then ends the epoch."""
-        position = np.zeros(3)
-        if self._smoother is not None:
-            self.epoch += 1
-            self._status.report_imu_came(stamp_ns, self.epoch)
-            position = self.state().nav_T_body[:3, 3]
-            self._final += self._smoother.all_poses()
-        elif self._rig.imu is not None and imu is None:
+        """Make a smoother with one state."""
+        if self._rig.imu is not None and imu is None:
             self._status.report_no_imu(stamp_ns)
         self._smoother = Smoother(self._config.smoother, self._rig.imu if imu else None)
-        initial = first_state_at(stamp_ns, position, imu, self._rig, self._config.initialisation)
+        initial = first_state_at(stamp_ns, np.zeros(3), imu, self._rig, self._config.initialisation)
         self._initialise_at(with_free_gravity(initial) if imu else initial)
         self._is_standstill_assumed = imu is not None and initial.is_known
 
@@ -237,6 +232,21 @@ class SmootherEstimator:
             self.covariance = self._running.state_covariance()
         except SOLVER_ERRORS as error:
             self._rebuild(self.latest_ns, self.state(), error)
+
+    def use_late_imu(self, motion: RelativeMotion, imu: tuple[ImuInterval, float]) -> None:
+        """Use the IMU from now on, after an initialisation without: keep the newest pose, and take gravity from it.
+
+        Args:
+            motion: By vision, that ends in the newest state.
+            imu: The IMU around the state and the state's place in that interval, seconds.
+        """
+        stamp_ns, state = self.latest_ns, self.state()
+        first = first_state_at(stamp_ns, np.zeros(3), imu, self._rig, self._config.initialisation)
+        self._final += [(ns, pose) for ns, pose in self._running.all_poses() if ns < stamp_ns]
+        self._smoother = Smoother(self._config.smoother, self._rig.imu)
+        self._initialise_at(with_late_imu(first, motion, state, self.covariance))
+        self.covariance = self._running.state_covariance()
+        self._report(stamp_ns, EventKind.IMU_CAME, "it is used from now on, and the path goes on")
 
     # ------------------------------------------------------------------ measurement update
 

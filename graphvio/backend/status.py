@@ -39,10 +39,6 @@ class StatusMonitor:
         if not initial.is_known:
             self._initialising_since_ns, self._was_complete, self._is_reported = initial.stamp_ns, False, False
 
-    def report_imu_came(self, stamp_ns: int, epoch: int) -> None:
-        """Report that an IMU came after an initialisation without one, which begins an epoch."""
-        self._report(stamp_ns, EventKind.IMU_CAME, f"the IMU has come: epoch {epoch} begins with gravity pointing down")
-
     def report_no_imu(self, stamp_ns: int) -> None:
         """Report an initialisation without the samples of the rig's IMU."""
         self._report(stamp_ns, EventKind.STARTED_WITHOUT_IMU, "no IMU samples came: vision alone from here")

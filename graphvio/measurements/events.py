@@ -47,7 +47,7 @@ class EventKind(StrEnum):
     STARTED_WITHOUT_IMU = "started_without_imu"
     """No IMU samples came while the odometry waited for them; it is initialised without."""
     IMU_CAME = "imu_came"
-    """IMU samples came after a start without them; a new epoch begins with roll and pitch from gravity."""
+    """IMU samples came after a start without them. The path goes on; of the paper's filter, a new epoch begins."""
 
     # ---------------------------------------------------------------- vision
     VISION_FAILED = "vision_failed"

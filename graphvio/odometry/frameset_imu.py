@@ -13,7 +13,7 @@ from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.geometry import se3
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import RelativeMotion, VisualResult
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.clock_watch import ClockWatch
 from graphvio.odometry.imu_clock import ImuClock
@@ -74,7 +74,9 @@ class FramesetImu:
     def watch(
         self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult, applied: RelativeMotion | None
     ) -> bool:
-        """Leave the IMU out while it contradicts vision; of single cameras, which need it, correct its clock.
+        """Leave the IMU out while it contradicts vision, and use one that comes late.
+
+        Of single cameras, which need the IMU, its clock is corrected.
 
         Args:
             stamp_ns: Stamp of a frameset, by which the state has been updated.
@@ -83,7 +85,7 @@ class FramesetImu:
             applied: The motion of it that the state has been updated by, or None.
 
         Returns:
-            Whether it is left out from now on, or used again, maybe by another clock.
+            Whether it is left out from now on, or used from now on, maybe by another clock.
         """
         if self._clock_watch is not None:
             assert isinstance(self._estimator, MonocularEstimator)
@@ -95,6 +97,11 @@ class FramesetImu:
         if self._watch is None:
             return False
         assert isinstance(self._estimator, ImuFaultTolerant)
+        if applied is not None and visual.quality is Quality.GOOD and not self._estimator.has_imu:
+            imu = self._synchroniser.initial_interval(stamp_ns)
+            if imu is not None:
+                self._estimator.use_late_imu(applied, imu)
+                return True
         was_left_out = self.is_left_out
         gate_result = None if interval is None else self._estimator.gate_results.get("vision")
         match = self._watch.update(stamp_ns, visual, gate_result, is_applied=applied is not None)
@@ -114,10 +121,12 @@ class FramesetImu:
         return self._synchroniser.precedes_imu(stamp_ns) and stamp_ns - self._first_ns < longest_ns
 
     def begins(self, stamp_ns: int) -> bool:
-        """Whether this is the first frameset, or an IMU has come after an initialisation without one."""
+        """Whether this is the first frameset, or an IMU has come that begins an epoch, see `watch` for others."""
         if self._estimator.has_imu:
             return False
-        return not self._estimator.is_initialised or self._synchroniser.initial_interval(stamp_ns) is not None
+        if not self._estimator.is_initialised:
+            return True
+        return self._watch is None and self._synchroniser.initial_interval(stamp_ns) is not None
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Return the IMU between two framesets, or None where it does not cover them, or is left out."""

@@ -137,7 +137,7 @@ class FilterEstimator:
         position = np.zeros(3)
         if self._filter is not None:
             self.epoch += 1
-            self._status.report_imu_came(stamp_ns, self.epoch)
+            self._report(stamp_ns, EventKind.IMU_CAME, f"epoch {self.epoch} begins with gravity pointing down")
             position = self.state().nav_T_body[:3, 3]
         elif self._rig.imu is not None and imu is None:
             self._status.report_no_imu(stamp_ns)
