@@ -20,6 +20,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
+from graphvio.rig_files.time_shifts import with_time_shifts
 from graphvio.wording import listed
 
 PINHOLE = "pinhole"
@@ -45,7 +46,6 @@ IMU_KEYS = {
 """graphvio's name of a noise density -> Kalibr's and EuRoC's key."""
 LINE_DELAY_KEY = "line_delay"
 """Seconds from one line of a rolling shutter to the next."""
-_MAX_TIME_SHIFT_SPREAD_S = 5e-3
 
 
 def load(path: Path) -> Rig:
@@ -61,8 +61,9 @@ def load(path: Path) -> Rig:
     has_imu = "T_cam_imu" in document.section(names[0]).values if names else False
     with named(path):
         cameras = cameras_of(document)
-        imu = imu_of(find_imu_file(path), time_offset_of(document)) if has_imu else None
-        return grouped_rig(cameras, imu, path.stem, path)
+        imu = imu_of(find_imu_file(path)) if has_imu else None
+        rig = grouped_rig(cameras, imu, path.stem, path)
+        return with_time_shifts(rig, time_shifts_of(document), path)
 
 
 def camera_names(document: Section) -> list[str]:
@@ -99,8 +100,8 @@ def line_time_us_of(section: Section) -> float:
     return 1e6 * section.number(LINE_DELAY_KEY, 0.0)
 
 
-def imu_of(path: Path, time_offset_s: float) -> Imu:
-    """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``.
+def imu_of(path: Path) -> Imu:
+    """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``; it has no time offset.
 
     Raises:
         RigError: if a noise value is missing, or body is not the IMU's frame.
@@ -111,25 +112,12 @@ def imu_of(path: Path, time_offset_s: float) -> Imu:
     if section.values.get("T_i_b") is not None and np.abs(section.matrix("T_i_b") - np.eye(4)).max() > 1e-9:
         raise RigError(f"{section.where('T_i_b')}: is not the identity; calibrate with this IMU as the only one")
     with named(path):
-        return Imu(**section.noise("update_rate", IMU_KEYS), time_offset_s=time_offset_s)
+        return Imu(**section.noise("update_rate", IMU_KEYS))
 
 
-def time_offset_of(document: Section) -> float:
-    """Compute the mean of the cameras' ``timeshift_cam_imu``, seconds; 0 where none is given.
-
-    Raises:
-        RigError: if the cameras disagree by more than 5 ms.
-    """
-    sections = [document.section(name) for name in camera_names(document)]
-    shifts = [section.number("timeshift_cam_imu", 0.0) for section in sections]
-    spread = max(shifts, default=0.0) - min(shifts, default=0.0)
-    if spread > _MAX_TIME_SHIFT_SPREAD_S:
-        raise RigError(
-            f"{document.file}: timeshift_cam_imu differs by {1e3 * spread:.1f} ms between "
-            "cameras; graphvio needs cameras that are triggered together: synchronise them or correct "
-            "their stamps"
-        )
-    return float(np.mean(shifts)) if shifts else 0.0
+def time_shifts_of(document: Section) -> dict[str, float]:
+    """Read ``timeshift_cam_imu`` of all cameras by name, seconds; 0 where it is missing."""
+    return {name: document.section(name).number("timeshift_cam_imu", 0.0) for name in camera_names(document)}
 
 
 def find_imu_file(camchain: Path) -> Path:
