@@ -46,6 +46,7 @@ IMU_KEYS = {
 """graphvio's name of a noise density -> Kalibr's and EuRoC's key."""
 LINE_DELAY_KEY = "line_delay"
 """Seconds from one line of a rolling shutter to the next."""
+_TIME_SHIFT_KEY = "timeshift_cam_imu"
 
 
 def load(path: Path) -> Rig:
@@ -115,9 +116,11 @@ def imu_of(path: Path) -> Imu:
         return Imu(**section.noise("update_rate", IMU_KEYS))
 
 
-def time_shifts_of(document: Section) -> dict[str, float]:
-    """Read ``timeshift_cam_imu`` of all cameras by name, seconds; 0 where it is missing."""
-    return {name: document.section(name).number("timeshift_cam_imu", 0.0) for name in camera_names(document)}
+def time_shifts_of(document: Section) -> dict[str, float | None]:
+    """Read ``timeshift_cam_imu`` of all cameras by name, seconds; None where it is missing."""
+    sections = {name: document.section(name) for name in camera_names(document)}
+    is_given = {name: section.values.get(_TIME_SHIFT_KEY) is not None for name, section in sections.items()}
+    return {name: each.number(_TIME_SHIFT_KEY) if is_given[name] else None for name, each in sections.items()}
 
 
 def find_imu_file(camchain: Path) -> Path:

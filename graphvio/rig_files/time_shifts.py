@@ -22,23 +22,28 @@ STAMP_DECIMALS = 9
 """Of seconds: stamps are in nanoseconds."""
 
 
-def with_time_shifts(rig: Rig, shifts_s: Mapping[str, float], path: Path) -> Rig:
+def with_time_shifts(rig: Rig, given_s: Mapping[str, float | None], path: Path) -> Rig:
     """Return a rig with the time shifts of its cameras, ``t_imu = stamp + shift``.
 
     Shifts that agree within 5 ms are taken for one, their mean. Otherwise each pair has the mean of its two cameras.
 
     Args:
         rig: without time offsets.
-        shifts_s: of the cameras in the file, by name.
+        given_s: of the cameras in the file, by name; None where there is none, which is 0 if all agree.
         path: of the file, for messages.
 
     Raises:
-        RigError: if those of a pair's left and right camera differ by more than 5 ms.
+        RigError: if those of a pair's left and right camera differ by more than 5 ms, or one is missing and others are
+            not near 0.
     """
+    shifts_s = {name: 0.0 if shift is None else shift for name, shift in given_s.items()}
     shifts = list(shifts_s.values())
     if max(shifts) - min(shifts) <= MAX_DIFFERENCE_S:
         imu = None if rig.imu is None else replace(rig.imu, time_offset_s=float(np.mean(shifts)))
         return replace(rig, imu=imu)
+    missing = [name for name, shift in given_s.items() if shift is None]
+    if missing:
+        raise RigError(f"{path}: {missing[0]} has no timeshift_cam_imu, and other cameras have different ones; add it")
     of_group = [_shift_of(group, shifts_s, path) for group in rig.groups]
     of_camera = {
         camera.name: shift for group, shift in zip(rig.groups, of_group, strict=True) for camera in group.cameras
