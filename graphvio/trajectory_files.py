@@ -1,7 +1,8 @@
 """Trajectory files: TUM, EuRoC and KITTI text formats, and topics with poses in a session or bag.
 
-TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point. EuRoC:
-``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. UZH-FPV's truth is TUM's with a row number in front.
+TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point; ORB-SLAM3
+writes it with nanoseconds, which of a Unix time cannot be seconds. EuRoC: ``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``,
+separated by commas. UZH-FPV's truth is TUM's with a row number in front.
 Stamps are converted exactly: float64 resolves only 0.2 microseconds of a Unix time.
 """
 
@@ -236,10 +237,13 @@ def _pose(fields: Sequence[str], is_euroc: bool, where: str) -> tuple[int, Float
         layout = "stamp_ns,x,y,z,qw,qx,qy,qz" if is_euroc else "stamp_s x y z qx qy qz qw"
         raise TrajectoryError(f"{where}: has {len(fields)} columns; a pose needs {_COLUMNS}: {layout}")
     unit = "" if is_euroc else _unit_of(fields[0])
-    if unit:
+    if unit and unit != "nanoseconds":
         raise _in_other_unit(where, unit)
     try:
-        stamp = int(fields[0]) if is_euroc else stamp_ns_from_seconds(fields[0])
+        if unit:
+            stamp = int(Decimal(fields[0]).to_integral_value())
+        else:
+            stamp = int(fields[0]) if is_euroc else stamp_ns_from_seconds(fields[0])
         values = np.array([float(field) for field in fields[1:_COLUMNS]])
     except ValueError as error:
         raise TrajectoryError(f"{where}: is not numeric ({error}); correct or remove the line") from None

@@ -44,7 +44,7 @@ from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
 from graphvio.monocular.warm_up import warm_up_keyframe_window
 from graphvio.png import undo_filters
 from graphvio.rig import Imu, Rig
-from graphvio.self_calibration.online import warm_up_adjustment
+from graphvio.self_calibration.warm_up import warm_up_adjustment
 from graphvio.slam.landmarks import orientations
 
 _POINTS = 20

@@ -15,6 +15,7 @@ import pytest
 import served
 from calibration_walks import recorded
 from command_line import graphvio, python
+from other_systems import write_openvins, write_orb_slam3, write_vins_fusion
 from pages import PAGES, ROOT, python_blocks, typed
 from rendered import copy_part
 from ros2_loopback import URI, free_domain
@@ -34,6 +35,7 @@ HERE = (
     "docs/how-to/fleet.md",
     "docs/how-to/live.md",
     "docs/how-to/optimization.md",
+    "docs/how-to/other-systems.md",
     "docs/how-to/public-data-sets.md",
     "docs/how-to/sensors/ros2.md",
     "docs/how-to/single-cameras.md",
@@ -126,6 +128,29 @@ def test_calibration(tmp_path: Path) -> None:
     assert load_rig(tmp_path / "rig-from-pairs.yaml").imu is not None
     (pair,) = load_rig(tmp_path / "front.yaml").pairs
     np.testing.assert_allclose(pair.right.body_T_cam[:3, 3], [0.11, 0.0, 0.0])  # right of the left one
+
+
+@pytest.mark.usefixtures("without_plots")
+def test_other_systems(session: Path, tmp_path: Path) -> None:
+    (tmp_path / "MH_01_easy").symlink_to(session / "walk")
+    rig = load_rig(tmp_path / "MH_01_easy").with_pairs([0])
+    write_openvins(tmp_path, rig, {})
+    write_vins_fusion(tmp_path, rig).rename(tmp_path / "euroc_stereo_imu_config.yaml")
+    write_orb_slam3(tmp_path, rig)
+    truth = load_trajectory(tmp_path / "MH_01_easy/mav0/state_groundtruth_estimate0/data.csv")
+    save_trajectory(truth, tmp_path / "traj_estimate.txt")
+    lines = [line.split() for line in (tmp_path / "traj_estimate.txt").read_text().splitlines()]
+    (tmp_path / "output").mkdir()
+    in_ns = zip(truth.stamps_ns.tolist(), lines, strict=True)
+    orb_slam3, vins_fusion = [], []
+    for stamp_ns, (_, x, y, z, *xyz, w) in in_ns:
+        orb_slam3.append(" ".join([f"{stamp_ns}.000000", x, y, z, *xyz, w]))
+        vins_fusion.append(",".join([str(stamp_ns), x, y, z, w, *xyz, "0.0", "0.0", "0.0", ""]))
+    (tmp_path / "f_dataset-MH01_stereoi.txt").write_text("\n".join(orb_slam3))
+    (tmp_path / "output/vio.csv").write_text("\n".join(vins_fusion))
+    run_commands("docs/how-to/other-systems.md", tmp_path)
+    assert len(load_rig(tmp_path / "rig.yaml").pairs) == 1
+    assert len(load_trajectory(tmp_path / "results/mh01/trajectory.txt")) > 30
 
 
 @pytest.mark.usefixtures("without_plots")

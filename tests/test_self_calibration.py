@@ -19,7 +19,7 @@ from graphvio.linear_algebra import eliminated, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
-from graphvio.self_calibration import online, solver
+from graphvio.self_calibration import solver, window_adjustment
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
 from graphvio.self_calibration.collector import FullWindow, WindowCollector
@@ -392,7 +392,7 @@ def test_self_calibration_leaves_out_what_cannot_be_solved(failure: str, monkeyp
         unknown = Gaussian(np.full_like(solution.calibration.mean, np.nan), solution.calibration.information)
         return solution._replace(calibration=unknown)
 
-    monkeypatch.setattr(online, "adjusted", fails_at_first)
+    monkeypatch.setattr(window_adjustment, "adjusted", fails_at_first)
     found = calibrated(SelfCalibration(rig), Walk(rig), 5.0)
     assert count > 2
     assert found.has_full_window
@@ -596,7 +596,7 @@ def test_adjustments_of_points_that_are_nearly_infinite_converge(
         solutions.append(adjusted(*arguments))
         return solutions[-1]
 
-    monkeypatch.setattr(online, "adjusted", keep)
+    monkeypatch.setattr(window_adjustment, "adjusted", keep)
     for seed in (1, 2, 3):
         error = draw(default_rig(), CalibrationErrorSizes.of_level(3, CAMERAS), seed)
         calibrated(SelfCalibration(error.written_rig), Flight(error.true_rig, seed=seed, farther=farther), 2.5)

@@ -9,14 +9,12 @@ import numpy as np
 from graphvio.arrays import Bool, Int
 from graphvio.config import Config
 from graphvio.frontend.handover import Handover, Leaving
-from graphvio.frontend.images import ImageMask, checked
+from graphvio.frontend.images import ImageMask
 from graphvio.frontend.overlaps import Overlaps
-from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
-from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.timing import timed
 
@@ -34,26 +32,8 @@ class SinglesFrontend(TrackingFrontend):
         self._overlaps = Overlaps(rig, config)
         self._handover = Handover(len(rig.singles))
 
-    def process(
-        self,
-        frameset: FrameSet,
-        motion_since: MotionPredictor,
-        readout: ReadoutMotion | None = None,
-        rotation_since: MotionPredictor | None = None,
-    ) -> VisualResult:
-        """Track the corners of a frameset.
-
-        Args:
-            frameset: Images of any subset of cameras.
-            motion_since: The back-end's predicted motion since an earlier stamp, from which the search begins.
-            readout: Motion of body while rolling shutters read the images out, or None.
-            rotation_since: The rotation by the gyro alone, from which the search begins where no motion is predicted.
-
-        Raises:
-            RigError: If an image does not fit the rig; nothing has changed then.
-        """
-        self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
+    def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
+        """Find the tracks in all cameras; what they show of the motion, the back-end measures."""
         is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
         reports = {j: _report(frame) for j, frame in seen.frames.items()}
         is_keyframe = not self._all_frozen and self._is_keyframe(

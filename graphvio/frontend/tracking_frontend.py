@@ -14,7 +14,7 @@ from graphvio.config import Config
 from graphvio.frontend.extrinsic_monitor import ExtrinsicError
 from graphvio.frontend.extrinsics import RigExtrinsics
 from graphvio.frontend.frozen import Frozen, FrozenImages
-from graphvio.frontend.images import ImageMask
+from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.motion_stereo import MotionHistory
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.references import References
@@ -88,7 +88,6 @@ class TrackingFrontend(ABC):
         self._has_rolling_shutter = any(camera.line_time_us for camera in rig.cameras)
         self._workers = ThreadPoolExecutor(len(rig.groups), thread_name_prefix="graphvio-pair")
 
-    @abstractmethod
     def process(
         self,
         frameset: FrameSet,
@@ -107,6 +106,13 @@ class TrackingFrontend(ABC):
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
+        self.stage_ms = {}
+        seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
+        return self._measure(seen, motion_since)
+
+    @abstractmethod
+    def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
+        """Measure what the tracks of a frameset show, and begin a keyframe if it is time for one."""
 
     @property
     def reference_stamps_ns(self) -> frozenset[int]:

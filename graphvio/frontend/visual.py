@@ -14,18 +14,16 @@ from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import is_of_singles, with_free_length
-from graphvio.frontend.images import ImageMask, checked
+from graphvio.frontend.images import ImageMask
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
 from graphvio.frontend.quality import CheckedHypothesis, checked_hypothesis, motion_with_quality, stereo_share
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
-from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.timing import timed
 
@@ -93,26 +91,8 @@ class VisualFrontend(TrackingFrontend):
 
     # ------------------------------------------------------------------ one frameset
 
-    def process(
-        self,
-        frameset: FrameSet,
-        motion_since: MotionPredictor,
-        readout: ReadoutMotion | None = None,
-        rotation_since: MotionPredictor | None = None,
-    ) -> VisualResult:
-        """Measure the motion of the rig from its reference to a frameset.
-
-        Args:
-            frameset: Images of any subset of pairs.
-            motion_since: The back-end's predicted motion since an earlier stamp, from which the search begins.
-            readout: Motion of body while rolling shutters read the images out; None continues that of the prediction.
-            rotation_since: The rotation by the gyro alone, from which the search begins where no motion is predicted.
-
-        Raises:
-            RigError: If an image does not fit the rig; nothing has changed then.
-        """
-        self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), motion_since, readout, rotation_since)
+    def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
+        """Measure the motion of the rig from its reference to a frameset."""
         agreement, reason = self._estimate_motion(seen, motion_since)
         judged = self._judge(seen, agreement, reason, motion_since)
         is_stationary = self._detect_standstill(seen, agreement)

@@ -1,4 +1,4 @@
-"""Rig files: graphvio's own ``rig.yaml``, and readers for EuRoC/ASL, Kalibr, Basalt and KITTI calibrations."""
+"""Rig files: graphvio's own ``rig.yaml``, and readers for the calibrations of other systems and data sets."""
 
 from graphvio.rig_files.joining import joined_rig
 from graphvio.rig_files.loading import find_rig, load_rig

@@ -3,13 +3,14 @@
 Kalibr's ``T_cam_imu`` maps points from the IMU's frame to the camera's, so ``body_T_cam`` is its inverse;
 ``timeshift_cam_imu`` has graphvio's sign, ``t_imu = t_cam + timeshift``. ``intrinsics`` are ``[fu, fv, pu, pv]``, and
 before them ``[xi, alpha]`` for the camera model ``ds``, ``[alpha, beta]`` for ``eucm`` and ``[xi]`` for ``omni``.
+OpenVINS has the same files with ``T_imu_cam``, which is ``body_T_cam``, and the IMU's matrices by other names.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,19 +48,23 @@ IMU_KEYS = {
 LINE_DELAY_KEY = "line_delay"
 """Seconds from one line of a rolling shutter to the next."""
 _TIME_SHIFT_KEY = "timeshift_cam_imu"
+_PLACE_KEYS = ("T_cam_imu", "T_imu_cam")
+"""Of a camera's place in the IMU's frame: Kalibr's, and OpenVINS's inverse of it."""
+_MIN_DETERMINANT = 1e-3
 
 
 def load(path: Path) -> Rig:
     """Read a camera chain, and if it has ``T_cam_imu`` the IMU's file from the same folder.
 
-    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without ``T_cam_imu`` the rig has no IMU, and body is cam0.
+    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without ``T_cam_imu`` or OpenVINS's ``T_imu_cam`` the rig has
+    no IMU, and body is cam0.
 
     Raises:
         RigError: if a file cannot be read or lacks a value, or they do not describe a usable rig.
     """
     document = read_yaml(path)
     names = camera_names(document)
-    has_imu = "T_cam_imu" in document.section(names[0]).values if names else False
+    has_imu = bool(names) and any(key in document.section(names[0]).values for key in _PLACE_KEYS)
     with named(path):
         cameras = cameras_of(document)
         imu = imu_of(find_imu_file(path)) if has_imu else None
@@ -113,7 +118,35 @@ def imu_of(path: Path) -> Imu:
     if section.values.get("T_i_b") is not None and np.abs(section.matrix("T_i_b") - np.eye(4)).max() > 1e-9:
         raise RigError(f"{section.where('T_i_b')}: is not the identity; calibrate with this IMU as the only one")
     with named(path):
-        return Imu(**section.noise("update_rate", IMU_KEYS))
+        noise = section.noise("update_rate", IMU_KEYS)
+        return Imu(**noise, **_imu_matrices(section))
+
+
+def _imu_matrices(section: Section) -> dict[str, Any]:
+    """Read scale and misalignment of Kalibr's model ``scale-misalignment``, or in OpenVINS's terms.
+
+    Both have a reading as ``M R value + bias`` with ``R`` from the IMU's frame to the sensor's, and graphvio the value
+    as a matrix times the reading. What the accelerations do to a gyro (``A``, ``Tg``) is left out.
+    """
+    if section.values.get("gyroscopes") is not None:
+        gyro, accel = section.section("gyroscopes"), section.section("accelerometers")
+        matrices = {"gyro_matrix": [(gyro, "M"), (gyro, "C_gyro_i")], "accel_matrix": [(accel, "M")]}
+    else:
+        matrices = {
+            "gyro_matrix": [(section, "Tw"), (section, "R_IMUtoGYRO")],
+            "accel_matrix": [(section, "Ta"), (section, "R_IMUtoACC")],
+        }
+    found = {}
+    for name, factors in matrices.items():
+        product = np.eye(3)
+        for part, key in factors:
+            if part.values.get(key) is not None:
+                product = product @ part.array(key, (3, 3))
+        if not np.abs(np.linalg.det(product)) > _MIN_DETERMINANT:
+            where = " and ".join(part.where(key) for part, key in factors)
+            raise RigError(f"{where}: cannot be inverted; write matrices that are nearly the identity")
+        found[name] = tuple(np.linalg.inv(product).ravel().tolist())
+    return found
 
 
 def time_shifts_of(document: Section) -> dict[str, float | None]:
@@ -130,7 +163,7 @@ def find_imu_file(camchain: Path) -> Path:
         RigError: if there is none, or there are several candidates.
     """
     stem = camchain.name
-    likely = [stem.replace("camchain-imucam", "imu"), stem.replace("camchain", "imu")]
+    likely = [stem.replace(*names) for names in (("camchain-imucam", "imu"), ("camchain", "imu"), ("imucam", "imu"))]
     for name in [*likely, "imu.yaml", "imu_config.yaml", "imu0.yaml"]:
         file = camchain.parent / name
         if name != stem and file.is_file() and not camera_names(read_yaml(file)):
@@ -142,7 +175,7 @@ def find_imu_file(camchain: Path) -> Path:
     defaults = ", ".join(f"{IMU_KEYS[name]}: {getattr(Imu(), name)}" for name in NOISE_KEYS)
     found = f"more than one IMU file ({listed(p.name for p in others)})" if others else "no imu.yaml"
     raise RigError(
-        f"{camchain}: has T_cam_imu, and {found} next to it; write one with the IMU's noise, such as  "
+        f"{camchain}: has an IMU, and {found} next to it; write one with the IMU's noise, such as  "
         f"{defaults}, update_rate: {Imu().rate_hz}"
     )
 
@@ -222,6 +255,8 @@ def _n_sphere(model: str) -> int:
 def _cam_T_body(section: Section, previous_T_body: Float, first: bool) -> Float:
     if section.values.get("T_cam_imu") is not None:
         return checked_transform(section.matrix("T_cam_imu"), section.where("T_cam_imu"))
+    if section.values.get("T_imu_cam") is not None:
+        return se3_inverse(checked_transform(section.matrix("T_imu_cam"), section.where("T_imu_cam")))
     if first:
         return np.eye(4)
     return checked_transform(section.matrix("T_cn_cnm1"), section.where("T_cn_cnm1")) @ previous_T_body

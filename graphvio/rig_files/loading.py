@@ -6,13 +6,15 @@ from pathlib import Path
 
 from graphvio.errors import RigError
 from graphvio.rig import Rig
-from graphvio.rig_files import basalt, colmap, euroc, kalibr, kitti, native
+from graphvio.rig_files import basalt, colmap, euroc, kalibr, kitti, native, orb_slam3, vins_fusion
 from graphvio.rig_files.reading import read_yaml
 
 _FORMATS = (
     "rig.yaml, Kalibr's camchain-imucam.yaml, Basalt's calibration.json, COLMAP's rig_config.json, an EuRoC/ASL folder "
-    "(mav0), KITTI's calib.txt or calib_cam_to_cam.txt"
+    "(mav0), KITTI's calib.txt or calib_cam_to_cam.txt, a configuration of OpenVINS, VINS-Fusion or ORB-SLAM3"
 )
+_OPENVINS_CHAIN_KEY = "relative_config_imucam"
+"""Of the camera chain, in OpenVINS's ``estimator_config.yaml``."""
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -21,7 +23,8 @@ def load_rig(path: str | Path) -> Rig:
     Args:
         path: ``rig.yaml``, a Kalibr camera chain, Basalt's ``calibration.json``, COLMAP's ``rig_config.json`` with its
             ``cameras.txt``, a ``sensor.yaml`` of an EuRoC/ASL folder, KITTI's ``calib.txt`` or
-            ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes precedence.
+            ``calib_cam_to_cam.txt``, a configuration of OpenVINS, VINS-Fusion or ORB-SLAM3; or a folder, in which
+            ``rig.yaml`` takes precedence.
 
     Returns:
         The rig.
@@ -55,14 +58,22 @@ def _load(path: Path) -> Rig:
     if path.suffix not in (".yaml", ".yml"):
         raise RigError(f"{path}: is no calibration file that graphvio knows; give one of: {_FORMATS}")
     document = read_yaml(path)
-    if native.VERSION_KEY not in document.values and kalibr.camera_names(document):
+    if native.VERSION_KEY in document.values:
+        return native.load(path)
+    if kalibr.camera_names(document):
         return kalibr.load(path)
-    if native.VERSION_KEY not in document.values and path.name != native.FILE_NAME:
-        raise RigError(
-            f"{path}: holds no calibration that graphvio knows; give one of: {_FORMATS}; a rig.yaml begins with  "
-            f"{native.VERSION_KEY}: {native.VERSIONS[-1]}"
-        )
-    return native.load(path)
+    if _OPENVINS_CHAIN_KEY in document.values:
+        return kalibr.load(path.parent / document.text(_OPENVINS_CHAIN_KEY))
+    if vins_fusion.is_config(document):
+        return vins_fusion.load(document)
+    if orb_slam3.is_settings(document):
+        return orb_slam3.load(document)
+    if path.name == native.FILE_NAME:
+        return native.load(path)  # which says what is missing
+    raise RigError(
+        f"{path}: holds no calibration that graphvio knows; give one of: {_FORMATS}; a rig.yaml begins with  "
+        f"{native.VERSION_KEY}: {native.VERSIONS[-1]}"
+    )
 
 
 def find_rig(folder: Path) -> Rig | None:
@@ -86,7 +97,7 @@ def find_rig(folder: Path) -> Rig | None:
     if raw is not None:
         has_images = any(folder.glob("image_0[0-3]"))
         return kitti.load_raw(raw, folder if has_images else None)
-    chains = sorted(folder.glob("*camchain*.yaml"))
+    chains = sorted([*folder.glob("*camchain*.yaml"), *folder.glob("*imucam_chain.yaml")])
     with_imu = [chain for chain in chains if "imucam" in chain.name]
     if len(with_imu or chains) > 1:
         names = ", ".join(chain.name for chain in with_imu or chains)

@@ -8,39 +8,28 @@ comes into force a fixed number of framesets after its adjustment began, so that
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Set
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import RigError
 from graphvio.kernels import await_compilers
-from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
-from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import (
-    EXACT,
-    MAX_FACTOR,
-    MIN_TWICE_LOG_BAYES_FACTORS,
-    Evidence,
-    FactorLikelihood,
-    Gaussian,
-)
+from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence
 from graphvio.self_calibration.findings import Finding, findings
-from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
 from graphvio.self_calibration.pixel_noise import pixel_noise
-from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
-from graphvio.self_calibration.solver import Solution
-from graphvio.self_calibration.window import Keyframe, View
+from graphvio.self_calibration.prior import file_prior, walk_per_second
+from graphvio.self_calibration.window import View
+from graphvio.self_calibration.window_adjustment import AdjustedWindow, WindowAdjustment
 
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
@@ -66,19 +55,6 @@ _PACES = (
     _Pace((8, WINDOW), 0.25, 8),
 )
 """Of the first windows; the last one is that of all later ones."""
-
-
-class _Adjusted(NamedTuple):
-    prior: Gaussian
-    solution: Solution
-    evidence: Evidence
-    estimate: CalibrationEstimate
-    extrinsics: dict[int, Float]
-    upper_covariance: Float
-    covariance: Float  # of the cameras' parameters that come into force
-    by_cameras: Float
-    window: tuple[Keyframe, ...]
-    is_full: bool
 
 
 class SelfCalibration:
@@ -123,7 +99,7 @@ class SelfCalibration:
         self._full_windows = 0
         self._used_windows = 0  # full ones, without those that are left out
         self._adjusted_at = 0  # keyframes of this window
-        self._pending: Future[_Adjusted] | None = None
+        self._pending: Future[AdjustedWindow | None] | None = None
         self._due_in = 0  # framesets
         self._consider = ConsiderCovariance(self._n_camera_parameters)
         self._gains = MotionGains(rig)
@@ -200,7 +176,7 @@ class SelfCalibration:
 
     def restart_imu(self) -> None:
         """Discard all that has IMU samples of before: those that come are of another clock."""
-        self._drop_pending()
+        self._pending = None
         self._discard_window()
         self._collector.forget_samples()
 
@@ -215,8 +191,7 @@ class SelfCalibration:
         if self._due_in > 0:
             self._due_in -= 1
             return False
-        pending, self._pending = self._pending, None
-        adjusted = _finished_adjustment(pending)
+        adjusted, self._pending = self._pending.result(), None
         if adjusted is None or not self._is_acceptable(adjusted):
             return False
         was_exact = self.estimate.is_file_exact
@@ -249,7 +224,7 @@ class SelfCalibration:
     def _pace(self) -> _Pace:
         return _PACES[min(self._full_windows, len(_PACES) - 1)]
 
-    def _is_acceptable(self, adjusted: _Adjusted) -> bool:
+    def _is_acceptable(self, adjusted: AdjustedWindow) -> bool:
         """Return whether an adjustment may come into force; one that contradicts those before it counts as refused."""
         calibration = adjusted.solution.calibration
         if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
@@ -261,7 +236,7 @@ class SelfCalibration:
         is_confirmed = self.has_full_window and self.estimate.is_file_exact
         return adjusted.is_full or adjusted.estimate.is_file_exact or not is_confirmed
 
-    def _put_in_force(self, adjusted: _Adjusted) -> None:
+    def _put_in_force(self, adjusted: AdjustedWindow) -> None:
         """Use an adjustment's result from now on, and its noise for the next windows."""
         if adjusted.is_full:
             self._evidence, self._refused = adjusted.evidence, 0
@@ -272,7 +247,7 @@ class SelfCalibration:
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
         ):
             self._sigma_px = pixel_noise(solution.errors2, self._sigma_px)
-        self._consider.extend(adjusted.window, adjusted.by_cameras)
+        self._consider.extend(adjusted.keyframes, adjusted.by_cameras)
         difference = adjusted.estimate.difference[:n]
         self._consider.set_calibration_in_force(difference, adjusted.covariance, self._since_newest())
         self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
@@ -294,18 +269,9 @@ class SelfCalibration:
         if self._refused >= _MAX_REFUSED:
             self._forget_extrinsics(range(len(self._rig.groups)))
 
-    def _drop_pending(self) -> None:
-        """Discard the window that is being adjusted, which is from before a break.
-
-        It waits for the adjustment, which reads what changes after this call.
-        """
-        if self._pending is not None:
-            wait([self._pending])
-            self._pending = None
-
     def _forget_extrinsics(self, groups: Iterable[int]) -> None:
         """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
-        self._drop_pending()
+        self._pending = None
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.after_random_walk(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
@@ -330,93 +296,25 @@ class SelfCalibration:
             self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.after_random_walk(duration_s * self._walk)
-        assumed = _assumed(self.estimate.file_factors)
-        prior = self._evidence.given(self._prior, assumed)
-        samples, difference = self._collector.samples_of(window), self.estimate.posterior.mean
+        samples = self._collector.samples_of(window)
         if is_full:
             self.on_full_window(FullWindow(window, samples, self._sigma_px))
-        self._pending = self._worker.submit(self._adjust, window, samples, difference, prior, assumed, is_full)
-
-    def _adjust(
-        self,
-        window: tuple[Keyframe, ...],
-        samples: InertialSamples | None,
-        difference: Float,
-        prior: Gaussian,
-        assumed: Float,
-        is_full: bool,
-    ) -> _Adjusted:
-        """Adjust a window; what is read here does not change while an adjustment is pending."""
-        await_compilers()
-        solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
-        evidence, likelihood, factors, twice_log_bayes_factor = self._judged(prior, solution)
-        if solution.has_converged and not np.array_equal(_assumed(factors), assumed):
-            # What the window says was linearised where another file led it.
-            prior = self._evidence.given(self._prior, _assumed(factors))
-            solution = adjusted(window, samples, self._nominal, solution.calibration.mean, prior, self._sigma_px)
-            evidence, likelihood, factors, twice_log_bayes_factor = self._judged(prior, solution)
-        posterior = evidence.given(self._prior, _assumed(factors))
-        n, in_force = self._n_camera_parameters, np.zeros_like(difference)
-        is_changed = self._prior.change is not None
-        if is_changed or (factors != EXACT).any():
-            in_force = evidence.given(self._prior, factors).mean
-        covariance = evidence.mean_square(self._prior, in_force, likelihood)[:n, :n]
-        extrinsics = {}
-        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, twice_log_bayes_factor, is_changed)
-        _ = estimate.rig  # build the rig now: it raises RigError here rather than later in the odometry's thread
-        anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
-        if not estimate.is_file_exact:
-            extrinsics = extrinsic_covariances(self._rig, anywhere.covariance)
-        by_cameras = solution.poses_by_cameras(n)
-        return _Adjusted(
-            prior,
-            solution,
-            evidence,
-            estimate,
-            extrinsics,
-            anywhere.covariance,
-            covariance,
-            by_cameras,
+        adjustment = WindowAdjustment(
+            self._rig,
+            self._nominal,
+            self._prior,
+            self.estimate.file_factors,
+            self._evidence,
+            self.estimate.posterior.mean,
             window,
+            samples,
+            self._sigma_px,
             is_full,
         )
-
-    def _judged(self, prior: Gaussian, solution: Solution) -> tuple[Evidence, FactorLikelihood, Float, float]:
-        """Return what a window and those before say, its likelihood, the file's factors, and their Bayes factor."""
-        evidence = self._evidence.with_window(prior, solution.calibration)
-        likelihood = FactorLikelihood(evidence, self._prior)
-        return evidence, likelihood, *evidence.file_factors(self._prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood)
+        self._pending = self._worker.submit(_when_compiled, adjustment)
 
 
-def warm_up_adjustment(rig: Rig) -> None:
-    """Adjust two keyframes that see one point, to compile or load the kernels."""
-    stamps_ns, point = (0, 100_000_000), np.full((1, 2), 100.0)
-    seen = View(np.zeros(1, dtype=np.int64), point, point, np.ones(1, dtype=bool), np.ones(1))
-    calibration = SelfCalibration(rig)
-    keyframes = tuple(Keyframe(stamp_ns, np.eye(4), {0: seen}) for stamp_ns in stamps_ns)
-    for stamp_ns in (-10_000_000, *stamps_ns, 110_000_000) if rig.imu is not None else ():
-        calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
-    prior = calibration.estimate.posterior
-    samples = calibration._collector.samples_of(keyframes)
-    adjusted(keyframes, samples, calibration._nominal, prior.mean, prior, FIRST_WINDOW_SIGMA_PX)
-    calibration.close()
-    information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
-    solve_lower(cholesky(information), right)
-    solve_rows(information, right)
-
-
-def _finished_adjustment(pending: Future[_Adjusted]) -> _Adjusted | None:
-    """Return an adjustment when it is done, or None where it says nothing."""
-    try:
-        adjusted = pending.result()
-    except np.linalg.LinAlgError:
-        return None  # measurements that determine nothing
-    except RigError:
-        # The estimated IMU parameters are outside what Imu accepts, so the IMU's measurements must be wrong.
-        return None
-    return adjusted if adjusted.solution.has_converged else None
-
-
-def _assumed(factors: Float) -> Float:
-    """Return the factors without those of exact parts, which may yet turn out to be wrong."""
-    return np.where(factors == EXACT, 1.0, factors)
+def _when_compiled(adjustment: WindowAdjustment) -> AdjustedWindow | None:
+    """Adjust a window as soon as another process has compiled what that needs."""
+    await_compilers()
+    return adjustment.result()

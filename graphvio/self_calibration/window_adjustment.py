@@ -1,0 +1,148 @@
+"""What one window says of the calibration, together with the full windows before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.errors import RigError
+from graphvio.rig import Rig
+from graphvio.self_calibration.adjustment import adjusted
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.evidence import (
+    EXACT,
+    MAX_FACTOR,
+    MIN_TWICE_LOG_BAYES_FACTORS,
+    Evidence,
+    FactorLikelihood,
+    FilePrior,
+    Gaussian,
+)
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
+from graphvio.self_calibration.prior import extrinsic_covariances
+from graphvio.self_calibration.solver import Solution
+from graphvio.self_calibration.window import Keyframe
+
+
+class AdjustedWindow(NamedTuple):
+    """A window's result.
+
+    Attributes:
+        keyframes: of the window.
+        is_full: whether the window is full.
+        prior: of the calibration's difference from the rig file, from before the window.
+        solution: of the window by itself.
+        evidence: of this window and the full ones before.
+        estimate: of the calibration, by this evidence and the rig file.
+        extrinsics: see `graphvio.self_calibration.online.SelfCalibration`.
+        upper_covariance: see there.
+        covariance: (C, C) of the cameras' parameters that come into force.
+        by_cameras: derivatives of the keyframes' poses with respect to the cameras' parameters.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    is_full: bool
+    prior: Gaussian
+    solution: Solution
+    evidence: Evidence
+    estimate: CalibrationEstimate
+    extrinsics: dict[int, Float]
+    upper_covariance: Float
+    covariance: Float
+    by_cameras: Float
+
+
+@dataclass(frozen=True, eq=False)
+class WindowAdjustment:
+    """A window that is to be adjusted, with all that the result depends on: another thread may do it.
+
+    Attributes:
+        rig: from the rig file.
+        nominal: its calibration.
+        file_prior: how far that is known.
+        factors: (G,) by which the rig file is taken to be wrong.
+        evidence: of the full windows before.
+        difference: (C,) of the calibration from the rig file, to begin at.
+        keyframes: of the window.
+        samples: of the IMU over it, or None.
+        sigma_px: noise of a corner's position.
+        is_full: whether the window is full.
+    """
+
+    rig: Rig
+    nominal: RigCalibration
+    file_prior: FilePrior
+    factors: Float
+    evidence: Evidence
+    difference: Float
+    keyframes: tuple[Keyframe, ...]
+    samples: InertialSamples | None
+    sigma_px: float
+    is_full: bool
+
+    def result(self) -> AdjustedWindow | None:
+        """Adjust the window; None where the measurements determine nothing, or an IMU that is impossible."""
+        try:
+            fitted = self._fitted(self.factors, self.difference)
+            if fitted.solution.has_converged and not np.array_equal(_inexact(fitted.factors), _inexact(self.factors)):
+                # What the window says was linearised where another file led it.
+                fitted = self._fitted(fitted.factors, fitted.solution.calibration.mean)
+            return self._judged(fitted) if fitted.solution.has_converged else None
+        except (np.linalg.LinAlgError, RigError):
+            return None
+
+    def _fitted(self, factors: Float, difference: Float) -> _Fitted:
+        """Solve the window with the rig file as wrong as some factors say, and find which are likeliest then."""
+        prior = self.evidence.given(self.file_prior, _inexact(factors))
+        solution = adjusted(self.keyframes, self.samples, self.nominal, difference, prior, self.sigma_px)
+        evidence = self.evidence.with_window(prior, solution.calibration)
+        likelihood = FactorLikelihood(evidence, self.file_prior)
+        found = evidence.file_factors(self.file_prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood)
+        return _Fitted(prior, solution, evidence, likelihood, *found)
+
+    def _judged(self, fitted: _Fitted) -> AdjustedWindow:
+        """Return what is known of the calibration now, and what of it comes into force."""
+        evidence, factors, n = fitted.evidence, fitted.factors, n_camera_parameters(self.rig)
+        is_changed, in_force = self.file_prior.change is not None, np.zeros_like(self.difference)
+        if is_changed or (factors != EXACT).any():
+            in_force = evidence.given(self.file_prior, factors).mean
+        estimate = CalibrationEstimate(
+            self.rig,
+            evidence.given(self.file_prior, _inexact(factors)),
+            in_force,
+            factors,
+            fitted.twice_log_bayes_factor,
+            is_changed,
+        )
+        _ = estimate.rig  # build the rig now: it raises RigError here rather than later in the odometry's thread
+        anywhere = evidence.given(self.file_prior, np.full_like(factors, MAX_FACTOR)).covariance
+        return AdjustedWindow(
+            self.keyframes,
+            self.is_full,
+            fitted.prior,
+            fitted.solution,
+            evidence,
+            estimate,
+            {} if estimate.is_file_exact else extrinsic_covariances(self.rig, anywhere),
+            anywhere,
+            evidence.mean_square(self.file_prior, in_force, fitted.likelihood)[:n, :n],
+            fitted.solution.poses_by_cameras(n),
+        )
+
+
+class _Fitted(NamedTuple):
+    prior: Gaussian
+    solution: Solution
+    evidence: Evidence
+    likelihood: FactorLikelihood
+    factors: Float
+    twice_log_bayes_factor: float
+
+
+def _inexact(factors: Float) -> Float:
+    """Return the factors without those of exact parts, which may yet turn out to be wrong."""
+    return np.where(factors == EXACT, 1.0, factors)
