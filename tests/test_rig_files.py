@@ -38,6 +38,7 @@ def assert_same(a: Rig, b: Rig) -> None:
     assert [pair.name for pair in a.pairs] == [pair.name for pair in b.pairs]
     for one, other in zip(a.cameras, b.cameras, strict=True):
         assert one.line_time_us == pytest.approx(other.line_time_us, abs=1e-9)
+        assert one.stamp_offset_s == other.stamp_offset_s
         assert (one.name, one.model, one.size_px, one.mask) == (
             other.name,
             other.model,

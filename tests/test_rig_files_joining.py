@@ -8,7 +8,6 @@ import pytest
 import yaml
 from command_line import graphvio
 
-from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
 from graphvio.rig import Imu, Rig, StereoPair
 from graphvio.rig_files import joined_rig, load_rig
@@ -82,8 +81,13 @@ def test_names_that_differ_are_kept(rig: Rig) -> None:
     assert guessed == ()
 
 
-def test_different_time_offsets_are_refused(rig: Rig) -> None:
+@pytest.mark.parametrize(("later_s", "offset_s"), [(0.01, 0.01), (-0.01, -0.01), (0.004, 0.0)])
+def test_different_time_offsets_become_offsets_of_stamps(rig: Rig, later_s: float, offset_s: float) -> None:
+    """With more than 5 ms between them devices run independently; less is an error of their calibration."""
     assert rig.imu is not None
-    late = replace(rig.with_pairs([1]), imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + 0.01))
-    with pytest.raises(RigError, match=r"differ by 10\.0 ms"):
-        joined_rig([rig.with_pairs([0]), late], "joined")
+    late = replace(rig.with_pairs([1]), imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + later_s))
+    joined, _ = joined_rig([rig.with_pairs([0]), late], "joined")
+    assert joined.imu == rig.imu
+    assert [camera.stamp_offset_s for camera in joined.cameras] == [0.0, 0.0, offset_s, offset_s]
+    again, _ = joined_rig([joined, late], "again")  # a rig that has offsets keeps them
+    assert [camera.stamp_offset_s for camera in again.cameras[:4]] == [0.0, 0.0, offset_s, offset_s]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -364,7 +365,10 @@ def test_late_stamps_of_a_pair_are_found_and_corrected(late_ms: float) -> None:
     odometry, estimates, events, truth = run_with_late_stamps(late_ms)
     (event,) = [each for each in events if each.kind == EventKind.TIME_OFFSET_OFF]
     assert event.stamp_ns - estimates[0].stamp_ns < CORRECTED_S * 1e9
-    assert any("back" in warning for warning in odometry.rig_warnings)
+    (warning,) = odometry.rig_warnings
+    added = re.search(r"back: .* add (-?[.0-9]+) to stamp_offset_s of its cameras", warning)
+    assert added is not None
+    assert 1e3 * float(added[1]) == pytest.approx(-late_ms, abs=2.0)
     assert all(e.status is Status.TRACKING for e in corrected(estimates))
     assert rmse_of(corrected(estimates), truth) < rmse_of(corrected(run_with_late_stamps(0.0)[1]), truth) + 0.001
 

@@ -68,6 +68,7 @@ def _description(joined: Rig, guessed: tuple[str, ...]) -> dict[str, Any]:
                 "cameras": [camera.name for camera in group.cameras],
                 "models": [camera.model for camera in group.cameras],
                 "sizes_px": [list(camera.size_px) for camera in group.cameras],
+                "stamp_offsets_s": [camera.stamp_offset_s for camera in group.cameras],
                 "baseline_m": group.baseline_m if isinstance(group, StereoPair) else None,
                 "position_in_body_m": group.left.body_T_cam[:3, 3].tolist(),
                 "viewing_direction_in_body": group.left.body_T_cam[:3, 2].tolist(),
@@ -85,10 +86,12 @@ def _group_line(group: dict[str, Any]) -> str:
     lenses = zip(group["sizes_px"], group["models"], strict=True)
     lens = " and ".join(dict.fromkeys(f"{width}x{height} {model}" for (width, height), model in lenses))
     pair = "single camera" if group["baseline_m"] is None else f"baseline {1e3 * group['baseline_m']:.1f} mm"
+    offsets = " and ".join(dict.fromkeys(f"{1e3 * offset_s:+.2f} ms" for offset_s in group["stamp_offsets_s"]))
     return (
         f"{group['name']}: {' and '.join(group['cameras'])}, {lens}, {pair}, at "
         f"{_vector(group['position_in_body_m'])} m in body, looks along {_vector(group['viewing_direction_in_body'])}"
         + (" (guessed)" if group["place_is_guessed"] else "")
+        + (f", stamps {offsets}" if any(group["stamp_offsets_s"]) else "")
     )
 
 

@@ -12,7 +12,7 @@ from graphvio.arrays import Image
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry.synchroniser import StampJumpFilter
-from graphvio.rig import Rig
+from graphvio.rig import Camera, Rig
 
 _SILENT_NS = 1_000_000_000  # a pair one of whose cameras has not delivered for so long is not waited for
 _MAX_WAITING = 32  # images of a camera, or matched ones of a pair: what a wait may hold at any sensible rate
@@ -37,7 +37,7 @@ class FramesetAssembler:
     The tolerance should be less than half of the shortest time between a camera's images.
 
     Args:
-        rig: with the names of the cameras.
+        rig: with the names of the cameras, and the offsets of their stamps.
         tolerance_ms: images whose stamps differ by no more are of the same instant.
         max_wait_ms: longest time from an image's arrival until its frameset is returned, as far as any call gives the
             time.
@@ -50,7 +50,7 @@ class FramesetAssembler:
         self._tolerance_ns = round(1e6 * tolerance_ms)
         self._max_wait_ns = round(1e6 * max_wait_ms)
         self._report = report
-        self._groups = [_Group(tuple(_Camera(each.name, report) for each in group.cameras)) for group in rig.groups]
+        self._groups = [_Group(tuple(_Camera(each, report) for each in group.cameras)) for group in rig.groups]
         self._places = {each.name: (group, each) for group in self._groups for each in group.cameras}
         self._now_ns: int | None = None
         self._given_ns: int | None = None
@@ -60,7 +60,7 @@ class FramesetAssembler:
 
         Args:
             camera: its name in the rig.
-            stamp_ns: on the clock of all cameras.
+            stamp_ns: on the clock of all cameras, without the camera's ``stamp_offset_s``, which is added here.
             image: (height, width).
             arrival_ns: host time of its arrival.
 
@@ -73,6 +73,7 @@ class FramesetAssembler:
             self._report(stamp_ns, EventKind.UNKNOWN_CAMERA, detail)
             return list(self._due())
         pair, place = self._places[camera]
+        stamp_ns += place.stamp_offset_ns
         place.newest_ns = arrival_ns if place.newest_ns is None else max(place.newest_ns, arrival_ns)
         for confirmed in place.jumps.confirm(_Arrived(stamp_ns, image, arrival_ns)):
             self._take(pair, place, confirmed)
@@ -242,6 +243,7 @@ class _Camera:
 
     Attributes:
         name: in the rig.
+        stamp_offset_ns: is added to its stamps.
         waiting: images whose partner has not come, by stamp.
         seen: stamps of the newest images.
         last_ns: stamp of the last image; the largest one would be wrong for ever if it was damaged.
@@ -249,8 +251,9 @@ class _Camera:
         jumps: holds back an image that is far ahead.
     """
 
-    def __init__(self, name: str, report: Report) -> None:
-        self.name = name
+    def __init__(self, camera: Camera, report: Report) -> None:
+        self.name = name = camera.name
+        self.stamp_offset_ns = camera.stamp_offset_ns
         self.waiting: list[_Arrived] = []
         self.seen: deque[int] = deque(maxlen=_REMEMBERED)
         self.last_ns: int | None = None

@@ -41,7 +41,7 @@ class FrameSet:
     """Images of one instant from any subset of the rig's pairs and single cameras.
 
     Attributes:
-        stamp_ns: camera clock, nanoseconds.
+        stamp_ns: the instant, camera clock, nanoseconds: ``stamp_offset_s`` of the cameras is added already.
         images: index in `graphvio.rig.Rig.groups` -> (left, right) of a pair, or (image,) of a single camera, each
             (height, width) uint8. A group that delivered nothing is absent. The arrays are referenced, not copied,
             until the same group's next images have come: a driver that fills the same buffer again has to hand over

@@ -105,7 +105,8 @@ class GroupClocks:
             late = f"{1e3 * abs(late_s):.1f} ms {'later' if late_s > 0.0 else 'earlier'}"
             self._warnings[group] = (
                 f"{self._names[group]}: its stamps are {late} than those of {self._names[first]} "
-                f"(sigma {1e3 * sigma_s:.1f} ms), which this run allows for; correct them at their source"
+                f"(sigma {1e3 * sigma_s:.1f} ms), which this run allows for; correct them at their source, or add "
+                f"{-late_s:.4f} to stamp_offset_s of its cameras in the rig file"
             )
             self._report(stamp_ns, EventKind.TIME_OFFSET_OFF, self._warnings[group])
         change_s = late_s - self._late_s.get(group, 0.0)

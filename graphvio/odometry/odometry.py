@@ -152,7 +152,8 @@ class Odometry:
         """Feed one IMU sample or frameset, and return at most one estimate.
 
         Args:
-            measurement: An IMU sample or a frameset; those of each sensor in time order.
+            measurement: An IMU sample or a frameset; those of each sensor in time order. Stamps of framesets are taken
+                as instants: a source has added ``stamp_offset_s`` of the rig's cameras to those of their images.
 
         Returns:
             The estimate of the oldest frameset that is due, or None while there is none. At most one frameset is

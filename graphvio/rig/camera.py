@@ -25,6 +25,7 @@ _ROUNDING = 1e-14
 _OVERLAP_DISTANCE_M = 5.0
 _GRID = 12  # points of an image, across and down
 _MAX_READOUT_US = 100e3
+_MAX_STAMP_OFFSET_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,8 @@ class Camera:
         mask: image file whose black pixels are not used (parts of the rig or of its carrier), or None.
         line_time_us: time from one line's exposure to the next one's, from the top, microseconds; 0 of a global
             shutter. An image's stamp is the instant of its first line.
+        stamp_offset_s: what is added to the stamps of this camera's images, to get instants on the clock of the rig's
+            cameras: negative where they are late. Sources add it; stamps of framesets are instants.
 
     Raises:
         RigError: if a value has the wrong shape, is not finite or out of range.
@@ -54,6 +57,7 @@ class Camera:
     body_T_cam: Float
     mask: Path | None = None
     line_time_us: float = 0.0
+    stamp_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
         where = f"camera {self.name}"
@@ -78,6 +82,8 @@ class Camera:
                 f"{where}: line_time_us is {self.line_time_us}; it must be in microseconds, and {height} lines take at "
                 f"most {1e-3 * _MAX_READOUT_US:g} ms"
             )
+        if not abs(self.stamp_offset_s) < _MAX_STAMP_OFFSET_S:  # also refuses NaN
+            raise RigError(f"{where}: stamp_offset_s is {self.stamp_offset_s}; it must be in seconds, less than one")
         set_value(self, "size_px", (int(width), int(height)))
         set_value(self, "intrinsics", intrinsics)
         set_value(self, "distortion", distortion)
@@ -96,6 +102,11 @@ class Camera:
     def readout_ns(self) -> int:
         """Time from the first line's exposure to the last one's, nanoseconds; 0 of a global shutter."""
         return round(1e3 * self.line_time_us * (self.size_px[1] - 1))
+
+    @property
+    def stamp_offset_ns(self) -> int:
+        """`stamp_offset_s` in nanoseconds."""
+        return round(1e9 * self.stamp_offset_s)
 
     @cached_property
     def cam_T_body(self) -> Float:

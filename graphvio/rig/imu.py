@@ -24,7 +24,8 @@ class Imu:
         gyro_random_walk: bias diffusion, rad/s^2/sqrt(Hz).
         accel_noise_density: white noise, m/s^2/sqrt(Hz).
         accel_random_walk: bias diffusion, m/s^3/sqrt(Hz).
-        time_offset_s: ``t_imu = t_cam + time_offset``, Kalibr's ``timeshift_cam_imu``.
+        time_offset_s: ``t_imu = t_cam + time_offset``, Kalibr's ``timeshift_cam_imu``; ``t_cam`` is the stamp of an
+            image plus the ``stamp_offset_s`` of its camera.
         gyro_matrix: (3, 3) by rows, scale and misalignment: angular velocities are multiplied by it.
         accel_matrix: (3, 3) by rows, the same for specific forces.
 

@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import FACTORY, CalibrationSigmas
 from graphvio.errors import RigError
-from graphvio.rig.camera import Camera
+from graphvio.rig.camera import Camera, as_written
 from graphvio.rig.groups import CameraGroup, SingleCamera, StereoPair
 from graphvio.rig.imu import Imu
 from graphvio.rig.lens_checks import intrinsics_fault, view_fault
@@ -160,6 +160,16 @@ class Rig:
             RigError: if no pair is left that shows the scale.
         """
         return replace(self, imu=None)
+
+    def without_stamp_offsets(self) -> Rig:
+        """Return the rig for images whose stamps are corrected already, as those of framesets are."""
+
+        def corrected(camera: Camera) -> Camera:
+            if camera.stamp_offset_s == 0.0:
+                return camera
+            return as_written(replace(camera, stamp_offset_s=0.0), camera.body_T_cam)
+
+        return self.with_cameras(corrected)
 
     def with_cameras(self, change: Callable[[Camera], Camera]) -> Rig:
         """Replace each camera by what a function makes of it.

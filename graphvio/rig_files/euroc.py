@@ -19,6 +19,7 @@ from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files import kalibr
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import Section, named, read_yaml
+from graphvio.rig_files.time_shifts import with_time_shifts
 
 _CHAIN = Path("dso/camchain.yaml")
 """TUM-VI's calibration, next to ``mav0``."""
@@ -99,10 +100,9 @@ def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
         for camera in names:
             if camera not in cameras:
                 raise RigError(f"{camera} is missing; the recording has it: add its calibration")
-        imu = None
-        if has_imu:
-            imu = kalibr.imu_of(kalibr.find_imu_file(chain), kalibr.time_offset_of(document))
-        return grouped_rig([cameras[camera] for camera in names], imu, name, chain)
+        imu = kalibr.imu_of(kalibr.find_imu_file(chain)) if has_imu else None
+        rig = grouped_rig([cameras[camera] for camera in names], imu, name, chain)
+        return with_time_shifts(rig, kalibr.time_shifts_of(document), chain)
 
 
 def _sensor(folder: Path) -> Section:

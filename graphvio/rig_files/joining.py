@@ -10,8 +10,7 @@ import numpy as np
 from graphvio.errors import RigError
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.rig import CameraGroup, Rig, SingleCamera, StereoPair
-
-_MAX_OFFSET_DIFFERENCE_S = 5e-3
+from graphvio.rig_files.time_shifts import MAX_DIFFERENCE_S, STAMP_DECIMALS
 
 
 def joined_rig(rigs: Sequence[Rig], name: str) -> tuple[Rig, tuple[str, ...]]:
@@ -22,6 +21,9 @@ def joined_rig(rigs: Sequence[Rig], name: str) -> tuple[Rig, tuple[str, ...]]:
     equal steps, so that two look forwards and backwards. Where names repeat, cameras are named ``cam0``, ``cam1`` and
     so on in the order of the rigs, and pairs ``pair0``, ``pair1`` ...
 
+    Where time offsets to the IMU differ by more than 5 ms, rigs are not triggered together: the first one's offset is
+    the IMU's, and by the others' differences from it the stamps of their cameras are corrected.
+
     Args:
         rigs: at least one.
         name: of the rig.
@@ -30,22 +32,16 @@ def joined_rig(rigs: Sequence[Rig], name: str) -> tuple[Rig, tuple[str, ...]]:
         The rig, and the names of the pairs and single cameras whose place is guessed.
 
     Raises:
-        RigError: if only a later rig has an IMU, or time offsets to the IMU differ by more than 5 ms.
+        RigError: if only a later rig has an IMU.
     """
     first, *others = rigs
     if first.imu is None and any(rig.imu is not None for rig in others):
         raise RigError(
             f"{name}: the first calibration has no IMU, but another one has; give the one with the IMU first"
         )
-    offsets_s = [rig.imu.time_offset_s for rig in rigs if rig.imu is not None]
-    if offsets_s and max(offsets_s) - min(offsets_s) > _MAX_OFFSET_DIFFERENCE_S:
-        raise RigError(
-            f"{name}: the time offsets to the IMU differ by {1e3 * (max(offsets_s) - min(offsets_s)):.1f} ms; graphvio "
-            "needs cameras that are triggered together: synchronise them or correct their stamps"
-        )
     groups: list[CameraGroup] = []
     guessed = []
-    for k, rig in enumerate(rigs):
+    for k, rig in enumerate(_on_one_clock(rigs)):
         is_known = k == 0 or rig.imu is not None
         guessed += [len(groups) + i for i in range(len(rig.groups)) if not is_known]
         groups += (rig if is_known else _turned(rig, first, k / len(rigs))).groups
@@ -54,6 +50,25 @@ def joined_rig(rigs: Sequence[Rig], name: str) -> tuple[Rig, tuple[str, ...]]:
     singles = tuple(group for group in groups if isinstance(group, SingleCamera))
     joined = Rig(pairs, first.imu, name, first.calibration_sigmas, singles)
     return joined, tuple(groups[i].name for i in guessed)
+
+
+def _on_one_clock(rigs: Sequence[Rig]) -> Sequence[Rig]:
+    """Correct the stamps of cameras to the clock of the first rig's, where time offsets to the IMU differ."""
+    offsets_s = [rig.imu.time_offset_s if rig.imu is not None else None for rig in rigs]
+    known_s = [offset_s for offset_s in offsets_s if offset_s is not None]
+    if not known_s or max(known_s) - min(known_s) <= MAX_DIFFERENCE_S:
+        return rigs
+    return [
+        rig if offset_s is None else _later(rig, offset_s - known_s[0])
+        for rig, offset_s in zip(rigs, offsets_s, strict=True)
+    ]
+
+
+def _later(rig: Rig, seconds: float) -> Rig:
+    """Return a rig whose cameras' corrected stamps are so much later."""
+    return rig.with_cameras(
+        lambda camera: replace(camera, stamp_offset_s=round(camera.stamp_offset_s + seconds, STAMP_DECIMALS))
+    )
 
 
 def _turned(rig: Rig, first: Rig, share: float) -> Rig:

@@ -21,6 +21,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
+from graphvio.rig_files.time_shifts import with_time_shifts
 from graphvio.wording import listed
 
 PINHOLE = "pinhole"
@@ -46,9 +47,9 @@ IMU_KEYS = {
 """graphvio's name of a noise density -> Kalibr's and EuRoC's key."""
 LINE_DELAY_KEY = "line_delay"
 """Seconds from one line of a rolling shutter to the next."""
+_TIME_SHIFT_KEY = "timeshift_cam_imu"
 _PLACE_KEYS = ("T_cam_imu", "T_imu_cam")
 """Of a camera's place in the IMU's frame: Kalibr's, and OpenVINS's inverse of it."""
-_MAX_TIME_SHIFT_SPREAD_S = 5e-3
 _MIN_DETERMINANT = 1e-3
 
 
@@ -66,8 +67,9 @@ def load(path: Path) -> Rig:
     has_imu = bool(names) and any(key in document.section(names[0]).values for key in _PLACE_KEYS)
     with named(path):
         cameras = cameras_of(document)
-        imu = imu_of(find_imu_file(path), time_offset_of(document)) if has_imu else None
-        return grouped_rig(cameras, imu, path.stem, path)
+        imu = imu_of(find_imu_file(path)) if has_imu else None
+        rig = grouped_rig(cameras, imu, path.stem, path)
+        return with_time_shifts(rig, time_shifts_of(document), path)
 
 
 def camera_names(document: Section) -> list[str]:
@@ -104,8 +106,8 @@ def line_time_us_of(section: Section) -> float:
     return 1e6 * section.number(LINE_DELAY_KEY, 0.0)
 
 
-def imu_of(path: Path, time_offset_s: float) -> Imu:
-    """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``.
+def imu_of(path: Path) -> Imu:
+    """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``; it has no time offset.
 
     Raises:
         RigError: if a noise value is missing, or body is not the IMU's frame.
@@ -117,7 +119,7 @@ def imu_of(path: Path, time_offset_s: float) -> Imu:
         raise RigError(f"{section.where('T_i_b')}: is not the identity; calibrate with this IMU as the only one")
     with named(path):
         noise = section.noise("update_rate", IMU_KEYS)
-        return Imu(**noise, time_offset_s=time_offset_s, **_imu_matrices(section))
+        return Imu(**noise, **_imu_matrices(section))
 
 
 def _imu_matrices(section: Section) -> dict[str, Any]:
@@ -147,22 +149,11 @@ def _imu_matrices(section: Section) -> dict[str, Any]:
     return found
 
 
-def time_offset_of(document: Section) -> float:
-    """Compute the mean of the cameras' ``timeshift_cam_imu``, seconds; 0 where none is given.
-
-    Raises:
-        RigError: if the cameras disagree by more than 5 ms.
-    """
-    sections = [document.section(name) for name in camera_names(document)]
-    shifts = [section.number("timeshift_cam_imu", 0.0) for section in sections]
-    spread = max(shifts, default=0.0) - min(shifts, default=0.0)
-    if spread > _MAX_TIME_SHIFT_SPREAD_S:
-        raise RigError(
-            f"{document.file}: timeshift_cam_imu differs by {1e3 * spread:.1f} ms between "
-            "cameras; graphvio needs cameras that are triggered together: synchronise them or correct "
-            "their stamps"
-        )
-    return float(np.mean(shifts)) if shifts else 0.0
+def time_shifts_of(document: Section) -> dict[str, float | None]:
+    """Read ``timeshift_cam_imu`` of all cameras by name, seconds; None where it is missing."""
+    sections = {name: document.section(name) for name in camera_names(document)}
+    is_given = {name: section.values.get(_TIME_SHIFT_KEY) is not None for name, section in sections.items()}
+    return {name: each.number(_TIME_SHIFT_KEY) if is_given[name] else None for name, each in sections.items()}
 
 
 def find_imu_file(camchain: Path) -> Path:

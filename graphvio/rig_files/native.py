@@ -1,6 +1,7 @@
 """graphvio's own ``rig.yaml``: any number of pairs and single cameras, and at most one IMU.
 
-Version 2 has ``single_cameras``, version 1 has not. A rig without single cameras is written in version 1.
+Version 2 has ``single_cameras``, and ``line_time_us`` and ``stamp_offset_s`` of cameras, version 1 has not. A rig
+without them is written in version 1.
 
 The format is documented with a full example in ``docs/reference/data-contract.md``.
 """
@@ -27,7 +28,11 @@ _IMU_MATRICES = ("gyro_matrix", "accel_matrix")
 _IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s", *_IMU_MATRICES)
 _PAIR_KEYS = ("name", "left", "right")
 _LINE_TIME_KEY = "line_time_us"
-_CAMERA_KEYS = ("name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask", _LINE_TIME_KEY)
+_STAMP_OFFSET_KEY = "stamp_offset_s"
+_CAMERA_KEYS_OF_VERSION_2 = (_LINE_TIME_KEY, _STAMP_OFFSET_KEY)
+_CAMERA_KEYS = (
+    "name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask", *_CAMERA_KEYS_OF_VERSION_2
+)  # fmt: skip
 
 
 def load(path: Path) -> Rig:
@@ -69,8 +74,9 @@ def parse(text: str, path: Path) -> Rig:
         imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
         name = document.text("name") if document.values.get("name") is not None else path.stem
         rig = checked_views(Rig(pairs, imu, name, _sigmas(document), singles))
-    if version == 1 and _has_rolling_shutter(rig):
-        raise RigError(f"{path}: {_LINE_TIME_KEY} is of version 2; write  {VERSION_KEY}: 2")
+    newer = _keys_of_version_2(rig)
+    if version == 1 and newer:
+        raise RigError(f"{path}: {newer[0]} is of version 2; write  {VERSION_KEY}: 2")
     return rig
 
 
@@ -95,7 +101,7 @@ def to_text(rig: Rig, folder: Path) -> str:
     """Format a rig as ``rig.yaml`` for a folder; paths of masks inside the folder are relative to it."""
     lines = [
         "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
-        f"{VERSION_KEY}: {VERSIONS[1] if rig.singles or _has_rolling_shutter(rig) else VERSIONS[0]}",
+        f"{VERSION_KEY}: {VERSIONS[1] if rig.singles or _keys_of_version_2(rig) else VERSIONS[0]}",
         f"name: {_quoted(rig.name)}",
     ]
     if rig.calibration_sigmas != FACTORY:
@@ -129,8 +135,9 @@ def to_text(rig: Rig, folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _has_rolling_shutter(rig: Rig) -> bool:
-    return any(camera.line_time_us for camera in rig.cameras)
+def _keys_of_version_2(rig: Rig) -> list[str]:
+    """Return the keys of version 2 that are needed for the rig's cameras."""
+    return [key for key in _CAMERA_KEYS_OF_VERSION_2 if any(getattr(camera, key) for camera in rig.cameras)]
 
 
 def _sigmas(document: Section) -> CalibrationSigmas:
@@ -179,6 +186,7 @@ def _camera(section: Section) -> Camera:
         body_T_cam=body_T_cam,
         mask=mask,
         line_time_us=section.number(_LINE_TIME_KEY, 0.0),
+        stamp_offset_s=section.number(_STAMP_OFFSET_KEY, 0.0),
     )
     return as_written(camera, body_T_cam)
 
@@ -203,6 +211,8 @@ def _camera_lines(camera: Camera, folder: Path) -> Iterable[str]:
         yield f"  - {_numbers(row)}"
     if camera.line_time_us:
         yield f"{_LINE_TIME_KEY}: {_number(camera.line_time_us)}  # rolling shutter"
+    if camera.stamp_offset_s:
+        yield f"{_STAMP_OFFSET_KEY}: {_number(camera.stamp_offset_s)}  # is added to the stamps of its images"
     if camera.mask is not None:
         mask, home = camera.mask.resolve(), folder.resolve()
         yield f"mask: {_quoted(str(mask.relative_to(home) if mask.is_relative_to(home) else mask))}"

@@ -37,7 +37,8 @@ class EurocWriter(RecordingWriter):
         rig: of the framesets.
 
     Attributes:
-        rig: as written: its cameras are renamed to ``cam0``, ``cam1`` and so on if they have other names.
+        rig: as written: its cameras are renamed to ``cam0``, ``cam1`` and so on if they have other names, and have no
+            offsets of stamps, as those of framesets are corrected.
 
     Raises:
         SessionError: if the folder is not empty or cannot be created.

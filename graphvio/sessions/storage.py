@@ -25,7 +25,7 @@ class RecordingWriter(ABC):
 
     Attributes:
         path: of the file or folder.
-        rig: of the framesets, as written.
+        rig: of the framesets, as written: without offsets of stamps, as those of framesets are corrected.
         stopped: why writing stopped, or None.
     """
 
@@ -34,7 +34,7 @@ class RecordingWriter(ABC):
 
     def __init__(self, path: Path, rig: Rig) -> None:
         self.path = path
-        self.rig = rig
+        self.rig = rig.without_stamp_offsets()
         self.stopped: str | None = None
 
     def __enter__(self) -> Self:

@@ -41,7 +41,7 @@ class SessionWriter(RecordingWriter):
 
     Args:
         path: of the file or folder, which must not exist.
-        rig: of the framesets; is written into the file.
+        rig: of the framesets; is written into the file, without offsets of stamps, which are corrected in framesets.
         image_format: raw, or PNG, which is smaller and slower.
         storage: creates the file or folder: MCAP, which loses at most the last second in a crash, or a bag.
 
@@ -64,7 +64,7 @@ class SessionWriter(RecordingWriter):
     ) -> None:
         super().__init__(path, rig)
         self.poses = 0
-        self._rig_text = to_text(rig, path.parent)
+        self._rig_text = to_text(self.rig, path.parent)
         self._format: ImageFormat = image_format
         self._has_begun = False
         self._first_ns: int | None = None

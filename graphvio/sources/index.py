@@ -20,7 +20,7 @@ class ImageSequence(Protocol):
 
     @property
     def stamps_ns(self) -> Int:
-        """(N,) stamps, camera clock, increasing."""
+        """(N,) stamps, as recorded, increasing; `Source` adds ``stamp_offset_s`` of the camera."""
 
     def read(self, row: int) -> Image:
         """Return the image of a row, (height, width) uint8; from any thread.
@@ -38,7 +38,7 @@ class ImageFiles:
     """Image files in one folder."""
 
     folder: Path  # that holds them
-    stamps_ns: Int  # (N,) increasing
+    stamps_ns: Int  # (N,) as recorded, increasing
     names: Sequence[str]  # of the files
 
     def read(self, row: int) -> Image:

@@ -46,7 +46,7 @@ class Source:
         rig: of the measurements; its IMU is None if the recording has no samples.
         faults: of the recording; complete once an iteration has ended, and counted again by the next one.
         frameset_count: number of framesets, of which those without usable images are not yielded.
-        stamps_ns: (N,) stamps of the framesets, camera clock, increasing.
+        stamps_ns: (N,) stamps of the framesets, camera clock, increasing; offsets of cameras' stamps are corrected.
         start_ns: stamp of the first frameset.
         end_ns: stamp of the last frameset.
         truth: file, session or bag from which `load_trajectory` reads the true trajectory, or None.
@@ -74,7 +74,7 @@ class Source:
         self.decodes_in_process = False
         self._images, self._masks = index.images, index.masks
         self._fit_cameras: set[str] = set()
-        stamps_ns = {name: images.stamps_ns for name, images in index.images.items()}
+        stamps_ns = {each.name: index.images[each.name].stamps_ns + each.stamp_offset_ns for each in rig.cameras}
         pairs = [match_sides(stamps_ns[pair.left.name], stamps_ns[pair.right.name], tolerance_ns) for pair in rig.pairs]
         pairs += [of_single(stamps_ns[single.name]) for single in rig.singles]
         self._framesets = _cut(

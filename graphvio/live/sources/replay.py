@@ -55,8 +55,8 @@ class Replay:
         self._pace = Pace(speed)
 
     def open(self) -> Rig:
-        """Return the rig of the recording."""
-        return self._recording.rig
+        """Return the rig of the recording, as of images whose stamps are corrected already."""
+        return self._recording.rig.without_stamp_offsets()
 
     def readings(self) -> Iterator[Reading]:
         """Yield samples and images when they are due, and at the end the recording's faults."""

@@ -135,7 +135,7 @@ class SimulatedRig:
         self._opened = open_recording(folder, self._rig)
         self._track = self._inertial(self._opened)
         self._faults = DeviceFaults.parse(self._fault_options, devices_of(self._opened.rig))
-        return self._opened.rig
+        return self._opened.rig.without_stamp_offsets()  # stamps of framesets are corrected already
 
     def readings(self) -> Iterator[Reading]:
         """Yield samples and images when they are due."""
