@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import logging
 import multiprocessing
@@ -39,7 +40,8 @@ from recordings import (
 )
 
 from graphvio import FrameSet, ImuSample, RigError, SourceError, open_source
-from graphvio.rig_files import save_rig
+from graphvio.rig import Rig, SingleCamera
+from graphvio.rig_files import load_rig, save_rig
 from graphvio.sources import Source
 from graphvio.sources.read_ahead import read_ahead
 from graphvio.sources.read_ahead_process import can_fork, read_ahead_in_process
@@ -630,6 +632,17 @@ def test_kitti_odometry_with_invalid_times_keeps_rows_and_images(tmp_path: Path)
     (tmp_path / "times.txt").unlink()
     with pytest.raises(SourceError, match=r"times\.txt: is missing"):
         open_source(tmp_path)
+
+
+def test_kitti_raw_yields_single_cameras_beside_a_pair(tmp_path: Path) -> None:
+    drive = write_kitti_raw(tmp_path / "2011_09_26")
+    shutil.copytree(drive / "image_00", drive / "image_02")
+    (pair,) = load_rig(drive.parent / "calib_cam_to_cam.txt").pairs
+    rig = Rig((pair,), singles=(SingleCamera(dataclasses.replace(pair.left, name="image_02")),))
+    seen = framesets(open_source(drive, rig))
+    assert [sorted(frameset.images) for frameset in seen] == 5 * [[0, 1]]
+    for frameset in seen:
+        np.testing.assert_array_equal(frameset.images[0][0], frameset.images[1][0])
 
 
 def test_kitti_raw_yields_framesets(tmp_path: Path) -> None:

@@ -26,10 +26,10 @@ def matches(path: Path) -> bool:
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
     """Index the cameras of a rig."""
     images = {}
-    for pair in rig.pairs:
-        stamps_ns, rows = read_times(path / pair.left.name / "timestamps.txt", _utc_ns, faults)
+    for group in rig.groups:
+        stamps_ns, rows = read_times(path / group.left.name / "timestamps.txt", _utc_ns, faults)
         names = [f"{row:010d}.png" for row in rows]
-        for camera in (pair.left, pair.right):
+        for camera in group.cameras:
             folder = path / camera.name / "data"
             if not folder.is_dir():
                 raise SourceError(
