@@ -74,10 +74,10 @@ class Mapper:
         self._places: list[Place] = []
         self._body_T_camera: list[Float] = []  # of the first camera, by the rig that was in force at each place
         if folder is not None:
-            kept = saved_map.load(folder, self._front_end.rig)
+            kept = saved_map.load(folder, self._front_end.rig, self._config)
             copy_database(folder / DATABASE, self._folder / DATABASE)
-            self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
-            self._body_T_camera = list(kept.body_T_camera)
+            self._graph, self._recognition = kept.graph, kept.recognition
+            self._places, self._body_T_camera = list(kept.places), list(kept.body_T_camera)
         self._first = len(self._places)  # first place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._front_end.rig)
@@ -133,7 +133,7 @@ class Mapper:
             MapError: If the folder contains other files, or cannot be written.
         """
         with self._working, self._lock:
-            kept = saved_map.to_saved(self._graph, self._recognition, self._places, self._body_T_camera)
+            kept = saved_map.SavedMap(self._graph, self._recognition, self._places, self._body_T_camera)
             saved_map.save(kept, self._store, self._front_end.rig, Path(folder))
 
     @property
