@@ -17,7 +17,7 @@ from graphvio.config import Config
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.places import ImageObserver, PairObserver
-from graphvio.optimization.loops.sift import Extractor, SiftExtractor, SiftProcess
+from graphvio.optimization.loops.sift import SiftExtractor, SiftProcess
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import Source
 from graphvio.sources.read_ahead import read_ahead
@@ -52,8 +52,8 @@ class PlaceObserver:
         self._rig = rig
         self._config = config
         self._of_thread = threading.local()
-        self._make: Callable[[int], Extractor] = SiftProcess if in_processes else SiftExtractor
-        self._made: list[Extractor] = []  # appending is atomic
+        self._make = SiftProcess if in_processes else SiftExtractor
+        self._made: list[SiftExtractor | SiftProcess] = []  # appending is atomic
 
     def __enter__(self) -> Self:
         return self
