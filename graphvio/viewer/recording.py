@@ -38,8 +38,7 @@ from graphvio.self_calibration.curves import Curve, curves_of, values_of
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.trajectory import Trajectory
 from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, as_entity, blueprint
-from graphvio.viewer.web import WebHost, WebOptions
-from graphvio.viewer.window import URL, open_window
+from graphvio.viewer.processes import WINDOW_URL, WebHost, WebOptions, open_window
 
 _MAX_SEGMENT_POSES = 100
 _SIGMAS = 3.0
@@ -75,7 +74,7 @@ class Recording:
             sinks.append(rr.FileSink(str(save)))
         if spawn:
             open_window()
-            sinks.append(rr.GrpcSink(URL))
+            sinks.append(rr.GrpcSink(WINDOW_URL))
         self._web = None if web is None else WebHost(web)
         if web is not None:
             sinks.append(rr.GrpcSink(web.data_url))
