@@ -135,19 +135,12 @@ def calibrate_trajectories(
 
 
 class _Recorded(NamedTuple):
-    """What a recording has for the calibration.
+    """What a recording has for the calibration."""
 
-    Attributes:
-        framesets: Number of framesets.
-        motions: Of each pair.
-        stamps_ns: (N,) of the IMU samples.
-        gyro: (N, 3) their angular rates, rad/s.
-    """
-
-    framesets: int
-    motions: Sequence[CameraMotions]
-    stamps_ns: Int
-    gyro: Float
+    framesets: int  # number of framesets
+    motions: Sequence[CameraMotions]  # of each pair
+    stamps_ns: Int  # (N,) of the IMU samples
+    gyro: Float  # (N, 3) their angular rates, rad/s
 
 
 def _track(source: Source, separate: SeparateMotions, on_frameset: OnFrameset | None) -> _Recorded:

@@ -36,35 +36,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions:
-    """What a live run is asked for.
+    """What a live run is asked for."""
 
-    Attributes:
-        source: ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path.
-        rig: rig or calibration file, or None for what the source carries.
-        config: profile, or YAML file.
-        cameras: the only cameras to be used, such as ``cam0,cam1``, or None for all.
-        no_pairs: whether cameras are used without their partners.
-        record: session to be written, or None.
-        png: whether its images are compressed.
-        view: whether the viewer's window opens.
-        health_port: port of health and metrics, or None for none.
-        duration_s: the run ends after so many seconds, or with the source if None.
-        forget_calibration: whether what earlier runs learnt of the calibration is forgotten.
-        services: for other programs, or None.
-    """
-
-    source: str
-    rig: Path | None
-    config: str
-    cameras: str | None
-    no_pairs: bool
-    record: Path | None
-    png: bool
-    view: bool
-    health_port: int | None
-    duration_s: float | None
-    forget_calibration: bool
-    services: Services | None
+    source: str  # ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path
+    rig: Path | None  # rig or calibration file, or None for what the source carries
+    config: str  # profile, or YAML file
+    cameras: str | None  # the only cameras to be used, such as ``cam0,cam1``, or None for all
+    no_pairs: bool  # whether cameras are used without their partners
+    record: Path | None  # session to be written, or None
+    png: bool  # whether its images are compressed
+    view: bool  # whether the viewer's window opens
+    health_port: int | None  # port of health and metrics, or None for none
+    duration_s: float | None  # the run ends after so many seconds, or with the source if None
+    forget_calibration: bool  # whether what earlier runs learnt of the calibration is forgotten
+    services: Services | None  # for other programs, or None
 
 
 def run_live(options: LiveOptions) -> None:

@@ -26,23 +26,14 @@ S = TypeVar("S", Estimate, Prediction)
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """State of the odometry that a server serves.
+    """State of the odometry that a server serves."""
 
-    Attributes:
-        version: Version of graphvio on the server.
-        run_id: Unique name of the odometry's run.
-        epoch: Epoch of the newest keyframe, or None before the first.
-        oldest_keyframe_id: Id of the oldest keyframe that is still kept.
-        next_keyframe_id: Id of the newest keyframe, plus one.
-        has_ended: Whether the odometry has ended: no keyframe will follow.
-    """
-
-    version: str
-    run_id: str
-    epoch: int | None
-    oldest_keyframe_id: int
-    next_keyframe_id: int
-    has_ended: bool
+    version: str  # version of graphvio on the server
+    run_id: str  # unique name of the odometry's run
+    epoch: int | None  # epoch of the newest keyframe, or None before the first
+    oldest_keyframe_id: int  # id of the oldest keyframe that is still kept
+    next_keyframe_id: int  # id of the newest keyframe, plus one
+    has_ended: bool  # whether the odometry has ended: no keyframe will follow
 
 
 @dataclass(frozen=True, slots=True, eq=False)

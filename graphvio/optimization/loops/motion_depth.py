@@ -32,42 +32,28 @@ _THEN, _NOW = 0, 1  # instants of a neighbour and of the place
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """The features of one image.
+    """The features of one image."""
 
-    Attributes:
-        pixels: (K, 2).
-        descriptors: (K, 128) uint8.
-    """
-
-    pixels: Float
-    descriptors: AnyArray
+    pixels: Float  # (K, 2)
+    descriptors: AnyArray  # (K, 128) uint8
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceMotion:
-    """Motion of body from one place to a neighbour.
+    """Motion of body from one place to a neighbour."""
 
-    Attributes:
-        place_T_neighbour: (4, 4).
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the neighbour.
-    """
-
-    place_T_neighbour: Float
-    covariance: Float
+    place_T_neighbour: Float  # (4, 4)
+    covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the neighbour
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Features of one camera at a place, and what is not known of all their depths together.
+    """Features of one camera at a place, and what is not known of all their depths together."""
 
-    Attributes:
-        frame: the features as tracks, with covariances of what the pixels do not show; ``has_depth`` are those whose
-            inverse depth exceeds three standard deviations.
-        shifts: (S, K) of their inverse depths, 1/m, for one standard deviation of each of S errors.
-    """
-
+    # the features as tracks, with covariances of what the pixels do not show; ``has_depth`` are those whose inverse
+    # depth exceeds three standard deviations
     frame: TrackedFrame
-    shifts: Float
+    shifts: Float  # (S, K) of their inverse depths, 1/m, for one standard deviation of each of S errors
 
 
 def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> TrackedFrame:

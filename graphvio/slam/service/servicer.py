@@ -30,14 +30,10 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Stream:
-    """An open stream.
+    """An open stream."""
 
-    Attributes:
-        client: Address of its client.
-        read_s: When its client last read a message, or opened it, by `time.monotonic`.
-    """
-
-    client: str
+    client: str  # address of its client
+    # when its client last read a message, or opened it, by `time.monotonic`
     read_s: float = field(default_factory=time.monotonic)
 
 
