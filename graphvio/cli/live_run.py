@@ -56,7 +56,9 @@ def run_live(options: LiveOptions) -> None:
     """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
     _check_recording(options)
     share_heap()
-    config = _config_of(options)
+    config = Config.load(options.config)
+    if options.services is not None:
+        config = options.services.settings(config)
     source = _source_of(options)
     if options.services is not None:
         options.services.check()
@@ -107,12 +109,6 @@ def _check_recording(options: LiveOptions) -> None:
         raise exists_error(path)
     if not path.parent.is_dir():
         raise SessionError(f"{path}: {path.parent} is no folder; make it first")
-
-
-def _config_of(options: LiveOptions) -> Config:
-    """Load the configuration, with what the services need."""
-    config = Config.load(options.config)
-    return config if options.services is None else options.services.settings(config)
 
 
 def _source_of(options: LiveOptions) -> LiveSource:
@@ -230,37 +226,26 @@ def _record(
 def _run_until_end(
     name: str, running: LiveOdometry, signals: StopSignals, started: Started | None, options: LiveOptions
 ) -> Exception | None:
-    """Run until the source has ended, a signal came, or the time is over.
+    """Run, and show what happens, until the source has ended, a signal came, a service failed, or the time is over.
 
     Returns:
         The error by which it ended, to be raised after everything until then is saved; None if there was none.
     """
+    until = None if options.duration_s is None else monotonic() + options.duration_s
     try:
-        _show_until_end(name, running, signals, options.duration_s, started)
+        with Dashboard(name, running.events.subscribe(64)) as dashboard:
+            while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
+                dashboard.show(running.status(), running.devices)
+                if started is not None:
+                    started.check()
+        if signals.came:
+            typer.echo("stopping: measurements that have come are processed and saved", err=True)
         running.stop()
     except Exception as error:
         with suppress(Exception):
             running.stop()
         return error
     return None
-
-
-def _show_until_end(
-    name: str, running: LiveOdometry, signals: StopSignals, duration_s: float | None, started: Started | None
-) -> None:
-    """Show what happens until the source has ended, a signal came, or the time is over.
-
-    Raises:
-        GraphvioError: that of a service which failed.
-    """
-    until = None if duration_s is None else monotonic() + duration_s
-    with Dashboard(name, running.events.subscribe(64)) as dashboard:
-        while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
-            dashboard.show(running.status(), running.devices)
-            if started is not None:
-                started.check()
-    if signals.came:
-        typer.echo("stopping: measurements that have come are processed and saved", err=True)
 
 
 def _report(figures: Figures, recorder: SessionRecorder | None, options: LiveOptions) -> None:
