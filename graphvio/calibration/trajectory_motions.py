@@ -71,7 +71,7 @@ def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: 
     """
     clock = first_relation(one, other, same_clock)
     segments = segments_of([one, other], [clock])
-    rows = np.array(of_one_length(segments), dtype=np.int64)
+    rows = of_one_length(segments)
     pose = paper_method.calibrate(segments.pairs.select(rows), seed).left2_T_left1
     for _ in range(_ROUNDS):
         segments = _with_noise(segments, pose)
@@ -81,7 +81,7 @@ def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: 
         if nuisances is not None:
             clock = clock.corrected(*found.nuisances.tolist())
             segments = segments_of([one, other], [clock])
-            rows = np.array(of_one_length(segments), dtype=np.int64)
+            rows = of_one_length(segments)
     segments = _long_enough(_with_noise(segments, pose))
     nuisances = None if same_clock else _clock_nuisances(one, other, clock, segments, pose)
     return TwoTrajectories(segments, clock, nuisances)
