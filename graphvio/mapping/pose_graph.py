@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -37,9 +38,14 @@ class TestedClosure:
     """A closure between two places of the graph, whose rows are the places' indices."""
 
     closure: LoopClosure  # the closure as it was found
-    edge: Edge  # the closure as a factor
     is_used: bool = False  # whether the solution uses it
     is_refuted: bool = False  # whether it contradicts the odometry alone
+
+    @cached_property
+    def edge(self) -> Edge:
+        """The closure as an edge between two places of the graph."""
+        found = self.closure
+        return Edge(found.reference.row, found.current.row, found.reference_T_current, found.covariance)
 
 
 class PoseGraph:
@@ -124,8 +130,7 @@ class PoseGraph:
         """
         is_new, asks_votes = False, False
         for closure in found:
-            one, other = closure.reference.row, closure.current.row
-            tested = TestedClosure(closure, Edge(one, other, closure.reference_T_current, closure.covariance))
+            one, other, tested = closure.reference.row, closure.current.row, TestedClosure(closure)
             self.closures.append(tested)
             is_inside = self.chains.fragment(one) == self.chains.fragment(other)
             if is_inside and self.chains.distance(tested.edge) > self._limit:

@@ -27,7 +27,6 @@ from graphvio.mapping.pose_graph import PoseGraph, TestedClosure
 from graphvio.mapping.recognition import Recognition
 from graphvio.mapping.store import DATABASE, PlaceStore
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
-from graphvio.optimization.solver import Edge
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.version import __version__
@@ -147,12 +146,7 @@ def _restored(columns: Mapping[str, AnyArray], found: Sequence[LoopClosure], con
     motions, covariances = columns["motions"], columns["motion_covariances"]
     chains = Chains.of(columns["starts"].tolist(), columns["firsts"], motions, covariances)
     closures = [
-        TestedClosure(
-            each,
-            Edge(each.reference.row, each.current.row, each.reference_T_current, each.covariance),
-            bool(is_used),
-            bool(is_refuted),
-        )
+        TestedClosure(each, bool(is_used), bool(is_refuted))
         for each, is_used, is_refuted in zip(found, columns["is_used"], columns["is_refuted"], strict=True)
     ]
     probability = config.optimization.loop_probability
