@@ -119,7 +119,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
     path_m = float(at_estimates.distances[-1])
     drift_m = _drift(used, at_estimates)
     rpe, kitti = relative_errors(used, at_estimates)
-    scale = align_scale(aligned.positions, at_estimates.positions) if path_m >= _MIN_PATH_M else None
+    scaled = align_scale(aligned.positions, at_estimates.positions) if path_m >= _MIN_PATH_M else (None, None)
     return Evaluation(
         associated=len(used),
         estimates=len(estimate),
@@ -128,8 +128,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
         ate_position_m=(ate := Stats.of(position_m)),
         ate_rotation_deg=Stats.of(rotation_deg),
         ate_percent=_percent(ate.rmse, path_m),
-        scale_error_percent=None if scale is None else scale.error_percent,
-        ate_scaled_m=None if scale is None else scale.rmse_m,
+        scale_error_percent=scaled[0],
+        ate_scaled_m=scaled[1],
         drift_m=drift_m,
         drift_percent=_percent(drift_m, path_m),
         loop_closure=_loop_closure(aligned, at_estimates, path_m),
