@@ -75,7 +75,8 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     wanted[ends] = wanted[ends + 1] = True
     wanted[0] = wanted[-1] = True
     wanted[record.own.reference] = wanted[record.own.row] = True
-    wanted[_last_of_references(motions.reference, motions.row)] = True
+    last = dict(zip(motions.reference.tolist(), motions.row.tolist(), strict=True))  # rows increase
+    wanted[list(last.values())] = True
     latest = stamps[0]
     seen = np.zeros(len(stamps), dtype=bool)
     seen[motions.row] = True
@@ -89,14 +90,6 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
             latest = stamps[row]
     chosen = np.flatnonzero(wanted[motions.reference] & wanted[motions.row])
     return Nodes(record, np.flatnonzero(wanted), chosen)
-
-
-def _last_of_references(reference: Int, row: Int) -> Int:
-    """Return the last row that is measured from each reference."""
-    last: dict[int, int] = {}
-    for k, r in zip(reference.tolist(), row.tolist(), strict=True):
-        last[k] = max(last.get(k, r), r)
-    return np.array(sorted(last.values()), dtype=np.int64)
 
 
 def spread(nodes: Nodes, nav_T_body: Float) -> Float:
