@@ -61,11 +61,7 @@ class PaperSolution:
 
 
 def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
-    """Calibrate by RANSAC, then Levenberg-Marquardt on the inliers.
-
-    Args:
-        pairs: N pose pairs.
-        seed: of the random triples.
+    """Calibrate by RANSAC, with a seed of its random triples, then Levenberg-Marquardt on the inliers.
 
     Raises:
         CalibrationError: with fewer than three pose pairs, without rotation, or if no solution explains three of them.

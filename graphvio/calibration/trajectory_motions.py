@@ -58,13 +58,7 @@ class TwoTrajectories:
 
 
 def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: int = 0) -> TwoTrajectories:
-    """Alternate between the relation of the clocks, the noise and the relative pose.
-
-    Args:
-        one: of the first camera, in any world frame.
-        other: of the second camera, in any world frame.
-        same_clock: whether both have one clock, so that there is no relation to estimate.
-        seed: of the random triples.
+    """Alternate between the relation of the clocks, unless both have one, the noise and the relative pose.
 
     Raises:
         CalibrationError: if no offset makes their angular speeds agree, or no relative pose explains their motions.

@@ -163,14 +163,7 @@ class Compared:
 def compare(
     names: Sequence[str], results: Sequence[Trajectory], truth: Trajectory, max_gap_s: float = MAX_GAP_S
 ) -> list[Compared]:
-    """Evaluate several results against the same truth; one that fails does not affect the others.
-
-    Args:
-        names: of the N results.
-        results: N trajectories of body.
-        truth: see `evaluate`.
-        max_gap_s: see `evaluate`.
-    """
+    """Evaluate several results against the same truth, see `evaluate`; one that fails does not affect the others."""
     compared: list[Compared] = []
     for name, result in zip(names, results, strict=True):
         try:

@@ -63,10 +63,7 @@ class Nodes:
 def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     """Choose the framesets that motions refer to, the first and last of each epoch, and others in between.
 
-    Args:
-        record: of a session.
-        interval_s: maximum time between states, if there are framesets; more of the motions that are measured from
-            one keyframe add little.
+    These are as far apart as the interval, if there are framesets: more motions from one keyframe add little.
     """
     stamps, motions = record.stamps_ns, record.motions
     wanted = record.is_keyframe.copy()

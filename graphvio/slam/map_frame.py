@@ -49,8 +49,7 @@ class _Correction:
 class MapFrame:
     """Estimator of ``map_T_odom`` in the newest epoch; thread-safe.
 
-    Args:
-        probability: Share of the chi-square distribution beyond which corrections are refused.
+    Corrections beyond a share of the chi-square distribution, the probability, are refused.
     """
 
     def __init__(self, probability: float) -> None:

@@ -41,11 +41,7 @@ class PairFeatures:
 class PlaceObserver:
     """Extracts the features of a place's images and matches them in stereo, in any thread; a context manager.
 
-    Args:
-        rig: of the images.
-        config: of the features.
-        in_processes: whether each thread that asks for features has a process that extracts them, for work in
-            parallel; see `graphvio.optimization.loops.sift`.
+    With ``in_processes``, each thread that asks for features has a process that extracts them: see `SiftProcess`.
     """
 
     def __init__(self, rig: Rig, config: Config, *, in_processes: bool = False) -> None:

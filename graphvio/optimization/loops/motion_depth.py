@@ -71,18 +71,9 @@ def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> TrackedFrame:
 def located(
     camera: Camera, stamp_ns: int, features: Features, neighbours: Sequence[tuple[Features | None, PlaceMotion]]
 ) -> Located:
-    """Triangulate a single camera's features at a place with those of neighbouring places.
+    """Triangulate a single camera's features at a place with its features at neighbouring places, if it has any there.
 
-    Of several neighbours that see a feature, the one that knows its depth best counts.
-
-    Args:
-        camera: that sees them.
-        stamp_ns: of the place.
-        features: at the place.
-        neighbours: features of the same camera at other places, or none, and the motions to these.
-
-    Returns:
-        The features, and six shifts for each of the neighbours.
+    Of several neighbours that see a feature, the one that knows its depth best counts. Each has six shifts.
     """
     frame = undetermined(camera, stamp_ns, features.pixels)
     points, covariances, has_depth = frame.points.copy(), frame.covariances.copy(), frame.has_depth.copy()
@@ -138,14 +129,9 @@ def _triangulated(camera: Camera, rays: Float, then: Float, place_T_neighbour: F
 
 
 def place_motion(record: SessionRecord, place: int, neighbour: int) -> PlaceMotion | None:
-    """Return the motion between two keyframes of a session, or None where the chain between them is broken.
+    """Return the motion between two keyframes, given by their rows, or None where the chain between them is broken.
 
     Errors of the motions from keyframe to keyframe are assumed to be independent.
-
-    Args:
-        record: of the session.
-        place: row of the one keyframe.
-        neighbour: row of the other.
     """
     first, last = sorted((place, neighbour))
     if record.epoch[first] != record.epoch[last]:

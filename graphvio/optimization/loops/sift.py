@@ -22,11 +22,7 @@ _PROGRAM = "from graphvio.optimization.loops.sift import serve; serve()"
 
 
 class SiftExtractor:
-    """Extracts features in the calling thread.
-
-    Args:
-        features: maximum number in an image, the largest ones.
-    """
+    """Extracts at most so many features of an image, the largest ones, in the calling thread."""
 
     def __init__(self, features: int) -> None:
         library = colmap()
@@ -49,11 +45,7 @@ class SiftExtractor:
 
 
 class SiftProcess:
-    """Extracts features in a process of its own, which ends with this one at the latest; for one thread at a time.
-
-    Args:
-        features: maximum number in an image, the largest ones.
-    """
+    """Does the same in a process of its own, which ends with this one at the latest; for one thread at a time."""
 
     def __init__(self, features: int) -> None:
         pipe = subprocess.PIPE
