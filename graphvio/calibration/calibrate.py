@@ -66,7 +66,12 @@ def calibrate_pairs(
         raise CalibrationError(f"{rig.name} has one stereo pair; there is no other to calibrate it against")
     recorded = _track(opened, SeparateMotions(rig, config or Config()), on_frameset)
     names = tuple(pair.name for pair in rig.pairs)
-    _check_moved(names, recorded)
+    for name, measured in zip(names, recorded.motions, strict=True):
+        if not measured.count:
+            raise CalibrationError(
+                f"{name} measured no motion at all in {recorded.framesets} framesets: does it see texture, are its "
+                "left and right images in this order and not another pair's, and is its own calibration right?"
+            )
     segments = segments_of_motions(recorded.motions)
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
@@ -124,7 +129,11 @@ def calibrate_trajectories(
 
     found, missing = pairwise(names, calibrate, scale_mode)
     extrinsics = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _NO_ERROR)
-    clocks = None if same_clock else {each: _clock(two[each], found[each]) for each in found}
+    clocks = (
+        None
+        if same_clock
+        else {each: Clock(two[each].clock, *result.nuisance_sigmas[:2].tolist()) for each, result in found.items()}
+    )
     drifts = [
         f"the clocks of {names[i]} and {names[j]} drift apart by {1e6 * clock.relation.drift:.0f} (+- "
         f"{1e6 * clock.drift_sigma:.0f}) microseconds per second; it is corrected here"
@@ -163,20 +172,6 @@ def _track(source: Source, separate: SeparateMotions, on_frameset: OnFrameset | 
     return _Recorded(framesets, separate.motions(), np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
 
 
-def _check_moved(names: Sequence[str], recorded: _Recorded) -> None:
-    """Refuse a recording in which a pair measured nothing.
-
-    Raises:
-        CalibrationError: if that is so.
-    """
-    for name, measured in zip(names, recorded.motions, strict=True):
-        if not measured.count:
-            raise CalibrationError(
-                f"{name} measured no motion at all in {recorded.framesets} framesets: does it see texture, are its "
-                "left and right images in this order and not another pair's, and is its own calibration right?"
-            )
-
-
 def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:
     """List segments of all cameras between the instants of the first."""
     return all_segments(motions[0].stamps_ns.tolist(), [each.between for each in motions])
@@ -193,7 +188,3 @@ def _imu(rig: Rig, segments: Segments, stamps_ns: Int, gyro: Float) -> tuple[dic
         except CalibrationError as error:
             missing.append(f"{pair.name}: {error}")
     return found, missing
-
-
-def _clock(both: TwoTrajectories, found: PairCalibration) -> Clock:
-    return Clock(both.clock, float(found.nuisance_sigmas[0]), float(found.nuisance_sigmas[1]))

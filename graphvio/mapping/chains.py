@@ -58,7 +58,7 @@ class Chains:
 
     def add(self, previous_T_body: Float, covariance: Float) -> None:
         """Add a place to the last fragment by its motion (4, 4) from the previous place, with covariance (6, 6)."""
-        covariance = _regular(covariance)
+        covariance = np.asarray(0.5 * (covariance + covariance.T) + EXACT)
         pose = self.poses[-1] @ previous_T_body
         adjoint = se3_adjoint(pose)
         n = len(self)
@@ -103,7 +103,3 @@ class Chains:
         self.covariances.append(covariance)
         self.poses.append(pose)
         self._sums.append(total)
-
-
-def _regular(covariance: Float) -> Float:
-    return np.asarray(0.5 * (covariance + covariance.T) + EXACT)

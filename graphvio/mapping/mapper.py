@@ -183,7 +183,9 @@ class Mapper:
 
     def _take(self, new: NewPlace) -> None:
         keyframe, clock = new.keyframe, self._times
-        self._use(keyframe.calibrated_rig or self._front_end.rig)
+        rig = keyframe.calibrated_rig or self._front_end.rig
+        if rig is not self._store.rig:  # see the place, and stored ones, with the calibration that is in force
+            self._store.rig, self._observer = rig, PlaceObserver(rig, self._config)
         frameset = FrameSet(keyframe.stamp_ns, keyframe.images)
         with clock.stage("features"):
             seen = self._observer.look(frameset)
@@ -220,12 +222,6 @@ class Mapper:
         if self._recognition.is_due:
             with clock.stage("vocabulary"):
                 self._recognition.learn(self._descriptors)
-
-    def _use(self, rig: Rig) -> None:
-        """See the new place, and stored ones, with the calibration that is in force."""
-        if rig is not self._store.rig:
-            self._store.rig = rig
-            self._observer = PlaceObserver(rig, self._config)
 
     def _may(self, earlier: int) -> bool:
         """Return whether a place may be compared with the newest one."""

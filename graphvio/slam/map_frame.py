@@ -125,7 +125,8 @@ class MapFrame:
             # A repeated correction of a keyframe is no independent one.
             self._refused = [*(each for each in self._refused if each.keyframe_id != keyframe_id), candidate]
             newest = self._refused[-self._agreement :]
-            if len(newest) == self._agreement and self._agree(newest):
+            is_enough = len(newest) == self._agreement
+            if is_enough and all(_distance(each, candidate) <= self._threshold for each in newest[:-1]):
                 self._agreement *= 2
                 self._accepted, self._estimate = newest[:-1], None
                 return self._accept(
@@ -162,10 +163,6 @@ class MapFrame:
         before = [each for each in self._accepted if each.keyframe_id <= candidate.keyframe_id]
         after = [each for each in self._accepted if each.keyframe_id > candidate.keyframe_id]
         return _fused([_carried(_fused(part), candidate) for part in (before, after[::-1]) if part])
-
-    def _agree(self, corrections: Sequence[_Correction]) -> bool:
-        last = corrections[-1]
-        return all(_distance(each, last) <= self._threshold for each in corrections[:-1])
 
 
 def _fused(corrections: Sequence[_Correction]) -> _Correction:

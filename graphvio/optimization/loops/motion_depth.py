@@ -81,7 +81,8 @@ def located(
     variances = np.full(len(features.pixels), np.inf)
     shifts = np.zeros((len(neighbours), _DIMENSIONS, len(features.pixels)))
     for number, (other, motion) in enumerate(neighbours):
-        if other is None or np.linalg.norm(_camera_motion(camera, motion)[:3, 3]) < _MIN_BASELINE_M:
+        camera_motion = camera.cam_T_body @ motion.place_T_neighbour @ camera.body_T_cam
+        if other is None or np.linalg.norm(camera_motion[:3, 3]) < _MIN_BASELINE_M:
             continue
         then, seen = camera.unproject(other.pixels)
         rows = alike(features.descriptors, other.descriptors)
@@ -100,10 +101,6 @@ def located(
         shifts[number][:, at] = shifted[:, better]
     made = replace(frame, points=points, covariances=covariances, has_depth=has_depth)
     return Located(made, shifts.reshape(-1, len(features.pixels)))
-
-
-def _camera_motion(camera: Camera, motion: PlaceMotion) -> Float:
-    return np.asarray(camera.cam_T_body @ motion.place_T_neighbour @ camera.body_T_cam)
 
 
 def _shifts(camera: Camera, rays: Float, then: Float, motion: PlaceMotion, found: Float) -> Float:

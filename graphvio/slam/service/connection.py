@@ -93,7 +93,9 @@ class Connection:
                 if is_over or not _may_pass(error, has_begun):
                     raise self._error(error) from None
             finally:
-                self._end(call)
+                call.cancel()
+                with self._lock:
+                    self._calls.discard(call)
             self._closing.wait(wait_s)
             wait_s = min(2.0 * wait_s, _MAX_WAIT_S)
 
@@ -113,11 +115,6 @@ class Connection:
             call = method(request, metadata=self._metadata)
             self._calls.add(call)
             return call
-
-    def _end(self, call: Any) -> None:
-        call.cancel()
-        with self._lock:
-            self._calls.discard(call)
 
     def _check_open(self) -> None:
         if self._closing.is_set():
