@@ -18,12 +18,12 @@ from graphvio.arrays import Float
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.errors import MeasurementError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.slam.checks import check_covariance, check_pose
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 
 _MAX_KEYFRAMES = 10_000  # that can be corrected; about an hour
 _MAX_CORRECTIONS = 200  # that are fused again when one comes late
 _FIRST_AGREEMENT = 3  # refused corrections in a row that must agree to be accepted; doubled each time
-_RIGID = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,18 +221,6 @@ def _checked(map_T_body: Float, covariance: Float) -> tuple[Float, Float]:
         pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
     except (TypeError, ValueError):
         raise MeasurementError("map_T_body or covariance is not an array of numbers; give (4, 4) and (6, 6)") from None
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise MeasurementError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
-    rotation = pose[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - [0, 0, 0, 1]).max())
-    if off > _RIGID or np.linalg.det(rotation) < 0.0:
-        raise MeasurementError(
-            f"map_T_body is not a rigid transform: off by {off:.2g}; give rotation and translation (4, 4)"
-        )
-    if spread.shape != (6, 6) or not np.isfinite(spread).all():
-        raise MeasurementError(
-            f"covariance has shape {spread.shape}, or holds NaN; give (6, 6) [rotation, translation]"
-        )
-    if not np.allclose(spread, spread.T, rtol=1e-6, atol=1e-12) or np.linalg.eigvalsh(spread)[0] <= 0.0:
-        raise MeasurementError("covariance is not symmetric and positive definite; give a variance for each direction")
+    check_pose(pose, "map_T_body")
+    check_covariance(spread, "covariance")
     return pose, 0.5 * (spread + spread.T)
