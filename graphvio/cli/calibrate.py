@@ -201,15 +201,14 @@ def _working(text: str) -> AbstractContextManager[object]:
 
 
 def _scale_mode(text: str) -> ScaleMode:
-    from typing import get_args
+    from typing import cast, get_args
 
     from graphvio.calibration.nuisances import ScaleMode
     from graphvio.errors import ConfigError
 
-    for mode in get_args(ScaleMode):
-        if text == mode:
-            return mode  # type: ignore[no-any-return]
-    raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
+    if text not in get_args(ScaleMode):
+        raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
+    return cast(ScaleMode, text)
 
 
 def _check_outputs(out: Path | None, report: Path | None, inputs: list[Path]) -> None:

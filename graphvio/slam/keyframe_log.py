@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
@@ -49,13 +48,8 @@ class KeyframeLog:
 
     def read(self, from_id: int, timeout_s: float | None = None) -> Keyframe | None:
         """Wait for the first keyframe that is kept, from an id on; None after the timeout, or where none will come."""
-        until = None if timeout_s is None else time.monotonic() + timeout_s
         with self._changed:
-            while self._next_id <= from_id and not self._is_closed:
-                left = None if until is None else until - time.monotonic()
-                if left is not None and left <= 0.0:
-                    return None
-                self._changed.wait(left)
+            self._changed.wait_for(lambda: self._next_id > from_id or self._is_closed, timeout_s)
             if self._next_id <= from_id or not self._kept:
                 return None
             return self._kept[bisect_left(self._kept, from_id, key=lambda kept: kept.id)]
