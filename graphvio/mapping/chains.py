@@ -73,10 +73,6 @@ class Chains:
         covariance = adjoint @ (self._sums[high] - self._sums[low]) @ adjoint.T
         return relative, 0.5 * (covariance + covariance.T)
 
-    def distance(self, edge: Edge) -> float:
-        """Return the squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
-        return edge.distance(*self.motion(edge.first, edge.second))
-
     def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
         """Add a fragment's motions as factors to a graph whose variables are the places' indices."""
         for place in self.fragments[fragment][1:]:

@@ -187,7 +187,7 @@ def _solve_with_closures(
         values = solve(graph, values, partial(on_progress, "with loops"))
         marginals = Marginals(graph, values)
         refused = np.flatnonzero(~is_used & (distances <= limit))
-        distances[refused] = [marginals.distance(edges[k]) for k in refused.tolist()]
+        distances[refused] = [edges[k].distance(marginals) for k in refused.tolist()]
         again = refused[distances[refused] <= limit]
         if not len(again):
             return _Closed(is_used, distances, used, graph, kinds, values, marginals)
