@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from graphvio.cli.dashboard import Dashboard, Figures, line_of, summary_of
+from graphvio.cli.dashboard import Dashboard, line_of, summary_of
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, reading_of, warn
 from graphvio.cli.warming import warm_up_visibly
@@ -73,16 +73,31 @@ def run_live(options: LiveOptions) -> None:
         stack.callback(running.stop)
         if viewer is not None:
             running.add_output(ViewOutput(viewer, lambda: running.odometry.calibration))
-        _serve_health(stack, running, options)
-        started = _start_services(stack, running, signals, options)
-        recorder = _record(recording, running, source, options)  # last: a port in use leaves no file behind
+        if options.health_port is not None:
+            health = HealthServer(running.status, port=options.health_port)
+            stack.callback(health.close)
+            typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
+        started = None
+        if options.services is not None:
+            started = options.services.start(running, stack, lambda: signals.came)
+            for line in started.lines:
+                typer.echo(line, err=True)
+        recorder = None
+        if options.record is not None:  # last: a port in use leaves no file behind
+            image_format: ImageFormat = "png" if options.png else "raw"
+            recorder = SessionRecorder(options.record, running.rig, image_format, waits=not source.is_realtime)
+            recording.callback(recorder.close)
+            running.add_output(recorder)
         running.start()
         failure = _run_until_end(source.name, running, signals, started, options)
         figures = running.status()
         is_whole = started is None or started.finish()
         if failure is not None:
             raise failure
-    _report(figures, recorder, options)
+    recorded = {} if recorder is None else {"recording": str(options.record), **recorder.status()}
+    publish({**figures, **recorded})
+    typer.echo(line_of(figures))
+    typer.echo(summary_of(figures))
     if memory is not None and figures.get("status_tracking"):
         _keep(memory, running)
     if recorder is not None and options.record is not None:
@@ -186,40 +201,6 @@ def _viewer(stack: ExitStack, rig: Rig, options: LiveOptions) -> Viewer | None:
     return viewer
 
 
-def _serve_health(stack: ExitStack, running: LiveOdometry, options: LiveOptions) -> None:
-    """Serve health and metrics, if they are asked for, until the stack closes."""
-    if options.health_port is None:
-        return
-    health = HealthServer(running.status, port=options.health_port)
-    stack.callback(health.close)
-    typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
-
-
-def _start_services(
-    stack: ExitStack, running: LiveOdometry, signals: StopSignals, options: LiveOptions
-) -> Started | None:
-    """Start the services for other programs, if they are asked for, until the stack closes."""
-    if options.services is None:
-        return None
-    started = options.services.start(running, stack, lambda: signals.came)
-    for line in started.lines:
-        typer.echo(line, err=True)
-    return started
-
-
-def _record(
-    stack: ExitStack, running: LiveOdometry, source: LiveSource, options: LiveOptions
-) -> SessionRecorder | None:
-    """Record the run, if that is asked for, until the stack closes."""
-    if options.record is None:
-        return None
-    image_format: ImageFormat = "png" if options.png else "raw"
-    recorder = SessionRecorder(options.record, running.rig, image_format, waits=not source.is_realtime)
-    stack.callback(recorder.close)
-    running.add_output(recorder)
-    return recorder
-
-
 # ---------------------------------------------------------------------- the run, and what is said and kept at its end
 
 
@@ -246,14 +227,6 @@ def _run_until_end(
             running.stop()
         return error
     return None
-
-
-def _report(figures: Figures, recorder: SessionRecorder | None, options: LiveOptions) -> None:
-    """Print the figures of a run, and publish them with those of its recording."""
-    recorded = {} if recorder is None else {"recording": str(options.record), **recorder.status()}
-    publish({**figures, **recorded})
-    typer.echo(line_of(figures))
-    typer.echo(summary_of(figures))
 
 
 def _keep(memory: CalibrationMemory, running: LiveOdometry) -> None:
