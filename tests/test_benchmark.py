@@ -16,8 +16,8 @@ from dataset_layouts import rendered_walk, true_poses
 from recordings import REAL_DATA
 
 from graphvio.benchmark.datasets import DATASETS, dataset_of, find_sequences
-from graphvio.benchmark.published import lengths_m, published_on
 from graphvio.benchmark.run import evaluate_with
+from graphvio.benchmark.table import lengths_m, published_on
 from graphvio.errors import BenchmarkError
 from graphvio.evaluation import evaluate
 from graphvio.measurements.sensors import FrameSet, ImuSample

@@ -8,7 +8,7 @@ from hand_eye import LEFT2_T_LEFT1, PERIOD_NS
 from monte_carlo import band
 from synthetic import pose_at, random_covariance, transform
 
-from graphvio.arrays import Float
+from graphvio.arrays import Float, Int
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.consistency import information
 from graphvio.calibration.segments import LENGTHS_S, all_segments, information_gains, most_informative, of_one_length
@@ -96,7 +96,7 @@ def test_most_informative_segments_are_disjoint_and_beat_any_length(gap_at: int 
         across = (pairs.start_ns < gap_at * PERIOD_NS) & (pairs.end_ns >= gap_at * PERIOD_NS)
         assert not across.any()
 
-    def gained(chosen: list[int]) -> float:
+    def gained(chosen: Int) -> float:
         known = information(segments.select(chosen).pairs, LEFT2_T_LEFT1)
         return float(np.trace(covariance @ known))
 
@@ -106,4 +106,4 @@ def test_most_informative_segments_are_disjoint_and_beat_any_length(gap_at: int 
             for row in range(len(segments))
             if segments.last[row] - segments.first[row] == length and segments.first[row] % length == 0
         ]
-        assert gained(rows) >= gained(of_length)
+        assert gained(rows) >= gained(np.array(of_length))

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from command_line import graphvio
 
-from graphvio.cli.requirements import REQUIRED
+from graphvio.cli.doctor import REQUIRED
 from graphvio.rig_files import save_rig
 from graphvio.simulation import default_rig
 from graphvio.version import __version__

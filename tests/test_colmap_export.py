@@ -76,7 +76,7 @@ def export_of(source: Source, folder: Path) -> Exported:
     odometry.finish()
     record = recorder.record()
     places = [Place(0, int(row), int(record.stamps_ns[row])) for row in choose_places(record, 0.25, 10.0)]
-    session = SessionInput(NAME, source, source.rig, places)
+    session = SessionInput(NAME, source, source.rig, places, record)
     optimization = optimize([record], [source.rig.imu], [], config)
     with FeatureDatabase(folder / "database.db") as database:
         stamps = [place.stamp_ns for place in places]

@@ -162,7 +162,7 @@ def test_places_from_before_a_correction_of_the_calibration_close_loops(made: Ma
     by_true_rig = [pose @ se3_inverse(walk.true_T_body(k)) for k, pose in enumerate(found.nav_T_body)]
     np.testing.assert_allclose(by_true_rig, expected.nav_T_body, atol=2e-4)
     assert count(mapper, "closures_used") == count(made.mapper, "closures_used")
-    saved = saved_map.load(tmp_path / "room", walk.rig)
+    saved = saved_map.load(tmp_path / "room", walk.rig, CONFIG)
     np.testing.assert_array_equal(saved.body_T_camera[0], walk.rig.pairs[0].left.body_T_cam)
     np.testing.assert_array_equal(saved.body_T_camera[-1], made.front_end.rig.pairs[0].left.body_T_cam)
 
@@ -338,11 +338,11 @@ def test_map_can_be_saved_during_run(tmp_path: Path) -> None:
         worker.start()
         while worker.is_alive():
             mapper.save(tmp_path / "now")
-            sizes.append(len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns))
+            sizes.append(len(saved_map.load(tmp_path / "now", walk.rig, CONFIG).places))
         worker.join()
         mapper.save(tmp_path / "now")
     assert sizes == sorted(sizes)
-    assert len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns) == count(mapper, "places") > 3
+    assert len(saved_map.load(tmp_path / "now", walk.rig, CONFIG).places) == count(mapper, "places") > 3
 
 
 def test_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_marginals_poses_are_those_of_each_pose(mixed: Optimization) -> None:
     marginals = Marginals(mixed.graph, mixed.values)
     together = marginals.poses(len(mixed.sessions[0].nodes.rows))
     for k in range(0, len(together), 10):
-        one = marginals.pose(k)
+        one = marginals.variable(x(k))
         np.testing.assert_allclose(together[k], one, rtol=0.0, atol=1e-6 * np.abs(one).max())
 
 

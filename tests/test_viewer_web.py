@@ -21,8 +21,7 @@ from graphvio.errors import GraphvioError
 from graphvio.measurements.estimate import Status
 from graphvio.viewer import Viewer, WebOptions
 from graphvio.viewer.layout import STATUS_COLOURS
-from graphvio.viewer.web import WebHost
-from graphvio.viewer.window import window_command
+from graphvio.viewer.processes import WebHost, window_command
 
 pytest.importorskip("rerun")
 
@@ -96,7 +95,7 @@ def test_web_host_of_killed_process_ends() -> None:
     options = free_options()
     code = f"""
 import time
-from graphvio.viewer.web import WebHost, WebOptions
+from graphvio.viewer.processes import WebHost, WebOptions
 host = WebHost(WebOptions({options.port}))
 print("serves", flush=True)
 time.sleep(60)

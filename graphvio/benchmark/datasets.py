@@ -127,12 +127,9 @@ def dataset_of(key: str) -> Dataset:
 
 
 def find_sequences(dataset: Dataset, folder: Path, rig: Path | None = None) -> list[Sequence]:
-    """Find the sequences of a data set in a folder, in the order of its table.
+    """Find the sequences of a data set in a folder that holds them at any place, in the order of its table.
 
-    Args:
-        dataset: of the sequences.
-        folder: that holds their recordings at any place, or is itself one.
-        rig: calibration of all of them; None looks for it where the data set has it.
+    Without a calibration for all of them, it is looked for where the data set has it.
 
     Raises:
         BenchmarkError: if there are none.

@@ -51,7 +51,8 @@ def write_report(benchmark: Benchmark, folder: Path) -> Path:
 
 
 def _sequence_page(benchmark: Benchmark, outcome: Outcome) -> str:
-    events = _events(outcome.results / "events.jsonl")
+    lines = (outcome.results / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    events = [json.loads(line) for line in lines]
     begin_ns = min((event["stamp_ns"] for event in events), default=0)
     if outcome.evaluation is not None:
         begin_ns = int(outcome.evaluation.stamps_ns[0])
@@ -73,10 +74,6 @@ def _sequence_page(benchmark: Benchmark, outcome: Outcome) -> str:
         calibration=(outcome.summary or {}).get("calibration", []),
         results=outcome.results.name,
     )
-
-
-def _events(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def _timeline(events: list[dict[str, Any]], begin_ns: int, outcome: Outcome) -> bytes:

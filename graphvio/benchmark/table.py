@@ -1,18 +1,47 @@
-"""The result of a benchmark as one document, and as the rows of the table that papers have."""
+"""The result of a benchmark as one document, and as the table that papers have, beside published figures of others."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import resources
 from typing import Any
 
+import yaml
+
 from graphvio.benchmark.datasets import Dataset
-from graphvio.benchmark.published import Published, lengths_m, published_on
 from graphvio.benchmark.run import Outcome
 from graphvio.version import __version__
 
 ALIGNMENT = "rmse of positions after SE(3) alignment of the whole causal trajectory, without scale"
 _WHOLE_SHARE = 0.8  # of a sequence's known length, from which on figures of whole sequences compare
+
+
+@dataclass(frozen=True)
+class Published:
+    """Figures of one system on one data set."""
+
+    system: str
+    method: str  # odometry or SLAM, and with which sensors
+    source: str  # paper and table
+    read_from: str  # where the figures were read: the paper, or a copy of its table
+    ate_m: Mapping[str, float]  # sequence -> rmse of positions after SE(3) alignment
+
+
+def published_on(key: str) -> list[Published]:
+    """Return what is known of a data set, by its key; empty if nothing could be verified."""
+    return [Published(**each) for each in _document().get(key, {}).get("systems", [])]
+
+
+def lengths_m(key: str) -> dict[str, float]:
+    """Return the lengths of whole sequences of a data set, as far as they are known."""
+    return dict(_document().get(key, {}).get("lengths_m", {}))
+
+
+@cache
+def _document() -> Any:
+    return yaml.safe_load(resources.files("graphvio.benchmark").joinpath("published.yaml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -64,17 +63,22 @@ def calibrate_pairs(
     rig = opened.rig
     if len(rig.pairs) < 2:
         raise CalibrationError(f"{rig.name} has one stereo pair; there is no other to calibrate it against")
-    recorded = _track(opened, SeparateMotions(rig, config or Config()), on_frameset)
+    framesets, motions, stamps_ns, gyro = _track(opened, SeparateMotions(rig, config or Config()), on_frameset)
     names = tuple(pair.name for pair in rig.pairs)
-    _check_moved(names, recorded)
-    segments = segments_of_motions(recorded.motions)
+    for name, measured in zip(names, motions, strict=True):
+        if not measured.count:
+            raise CalibrationError(
+                f"{name} measured no motion at all in {framesets} framesets: does it see texture, are its "
+                "left and right images in this order and not another pair's, and is its own calibration right?"
+            )
+    segments = segments_of_motions(motions)
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
         return calibrate_pair(segments.of_both(one, other), seed, scale_mode=mode)
 
     found, missing = pairwise(names, calibrate, scale_mode)
     extrinsics = place_all(found, names, segments)
-    imu, unchecked = _imu(rig, segments, recorded.stamps_ns, recorded.gyro)
+    imu, unchecked = _imu(rig, segments, stamps_ns, gyro)
     made = Calibration(names, extrinsics, rig, imu)
     return replace(made, warnings=(*extrinsics.warnings, *missing, *rig_warnings(made), *unchecked))
 
@@ -124,7 +128,11 @@ def calibrate_trajectories(
 
     found, missing = pairwise(names, calibrate, scale_mode)
     extrinsics = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _NO_ERROR)
-    clocks = None if same_clock else {each: _clock(two[each], found[each]) for each in found}
+    clocks = (
+        None
+        if same_clock
+        else {each: Clock(two[each].clock, *result.nuisance_sigmas[:2].tolist()) for each, result in found.items()}
+    )
     drifts = [
         f"the clocks of {names[i]} and {names[j]} drift apart by {1e6 * clock.relation.drift:.0f} (+- "
         f"{1e6 * clock.drift_sigma:.0f}) microseconds per second; it is corrected here"
@@ -134,24 +142,13 @@ def calibrate_trajectories(
     return Calibration(tuple(names), extrinsics, clocks=clocks, warnings=(*extrinsics.warnings, *missing, *drifts))
 
 
-class _Recorded(NamedTuple):
-    """What a recording has for the calibration.
+def _track(
+    source: Source, separate: SeparateMotions, on_frameset: OnFrameset | None
+) -> tuple[int, list[CameraMotions], Int, Float]:
+    """Track every pair by itself through a recording, as long as ``on_frameset`` wants it, and collect the gyro.
 
-    Attributes:
-        framesets: Number of framesets.
-        motions: Of each pair.
-        stamps_ns: (N,) of the IMU samples.
-        gyro: (N, 3) their angular rates, rad/s.
+    Returns the number of framesets, the motions of each pair, and stamps (N,) and angular rates (N, 3), rad/s, of body.
     """
-
-    framesets: int
-    motions: Sequence[CameraMotions]
-    stamps_ns: Int
-    gyro: Float
-
-
-def _track(source: Source, separate: SeparateMotions, on_frameset: OnFrameset | None) -> _Recorded:
-    """Track every pair by itself through a recording, as long as ``on_frameset`` wants it, and collect the gyro."""
     stamps_ns: list[int] = []
     gyro: list[Float] = []
     framesets = 0
@@ -167,21 +164,7 @@ def _track(source: Source, separate: SeparateMotions, on_frameset: OnFrameset | 
                     break
     finally:
         separate.close()
-    return _Recorded(framesets, separate.motions(), np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
-
-
-def _check_moved(names: Sequence[str], recorded: _Recorded) -> None:
-    """Refuse a recording in which a pair measured nothing.
-
-    Raises:
-        CalibrationError: if that is so.
-    """
-    for name, measured in zip(names, recorded.motions, strict=True):
-        if not measured.count:
-            raise CalibrationError(
-                f"{name} measured no motion at all in {recorded.framesets} framesets: does it see texture, are its "
-                "left and right images in this order and not another pair's, and is its own calibration right?"
-            )
+    return framesets, separate.motions(), np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3)
 
 
 def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:
@@ -200,7 +183,3 @@ def _imu(rig: Rig, segments: Segments, stamps_ns: Int, gyro: Float) -> tuple[dic
         except CalibrationError as error:
             missing.append(f"{pair.name}: {error}")
     return found, missing
-
-
-def _clock(both: TwoTrajectories, found: PairCalibration) -> Clock:
-    return Clock(both.clock, float(found.nuisance_sigmas[0]), float(found.nuisance_sigmas[1]))

@@ -44,10 +44,9 @@ class Advice:
         begin = "enough" if self.is_enough else self.missing or "go on like this"
         if not np.isfinite(self.rotation_sigma_deg):
             return f"{begin} ({self.motions} motions)"
-        return (
-            f"{begin} ({self.name}: +- {self.rotation_sigma_deg:.3f} degrees, "
-            f"{_length(self.translation_sigma_m)}, {self.motions} motions)"
-        )
+        sigma_m = self.translation_sigma_m
+        offset = f"{1e3 * sigma_m:.1f} mm" if sigma_m < 1.0 else "offset unknown"
+        return f"{begin} ({self.name}: +- {self.rotation_sigma_deg:.3f} degrees, {offset}, {self.motions} motions)"
 
 
 class Guide:
@@ -103,7 +102,3 @@ class Guide:
         rotation, translation = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])
         missing = "; ".join(observability.missing)
         return Advice(self._names[j], len(segments), float(np.rad2deg(rotation)), float(translation), missing)
-
-
-def _length(metres: float) -> str:
-    return f"{1e3 * metres:.1f} mm" if metres < 1.0 else "offset unknown"

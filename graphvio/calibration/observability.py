@@ -27,21 +27,16 @@ _AXES = ("x (right)", "y (down)", "z (forward)")
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """The directions of a relative pose that motions determine, and those that they do not.
+    """The directions of a relative pose that motions determine, and those that they do not."""
 
-    Attributes:
-        translation_singular_values: (3,) of the problem of the translation, eq. (6), as rms rotation, rad, in
-            descending order; two of them must be well above the noise.
-        turning_rad: (3,) rms rotation about principal axes, singular values of the problem of the rotation, eq. (5).
-        undetermined: (K, 6) orthonormal directions, tangent in left1, that the motions do not determine.
-        covariance: (6, 6) of ``left2_T_left1``, tangent in left1; very large along undetermined directions.
-        missing: a sentence on each undetermined part and what to do about it; empty if everything is determined.
-    """
-
+    # (3,) of the problem of the translation, eq. (6), as rms rotation, rad, in descending order; two of them must be
+    # well above the noise
     translation_singular_values: Float
+    # (3,) rms rotation about principal axes, singular values of the problem of the rotation, eq. (5)
     turning_rad: Float
-    undetermined: Float
-    covariance: Float
+    undetermined: Float  # (K, 6) orthonormal directions, tangent in left1, that the motions do not determine
+    covariance: Float  # (6, 6) of ``left2_T_left1``, tangent in left1; very large along undetermined directions
+    # a sentence on each undetermined part and what to do about it; empty if everything is determined
     missing: tuple[str, ...]
 
     @property

@@ -161,11 +161,11 @@ def calibrate_pair(
             the motions; the message says what to do.
     """
     nuisances = Nuisances.none(len(segments)) if nuisances is None else nuisances
-    rows = np.array(of_one_length(segments), dtype=np.int64)
+    rows = of_one_length(segments)
     first = segments.pairs.select(rows)
     initial = graph.solve(first, paper_method.calibrate(first, seed).left2_T_left1, nuisances.select(rows))
     gains = information_gains(segments.pairs, initial.left2_T_left1, initial.covariance)
-    rows = np.array(most_informative(segments, gains), dtype=np.int64)
+    rows = most_informative(segments, gains)
     pairs, nuisances = segments.pairs.select(rows), nuisances.select(rows)
     checked = _check_scale(pairs, initial.left2_T_left1, nuisances)
     frames = segments.pairs.select(segments.last - segments.first == 1)

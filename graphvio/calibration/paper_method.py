@@ -19,7 +19,6 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs, inverses
 from graphvio.errors import CalibrationError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, skew, so3_exp
-from graphvio.kernels import kernel
 
 _TRIPLES = 500
 _CANDIDATES = 10  # best triples, which are refined before one is chosen
@@ -62,11 +61,7 @@ class PaperSolution:
 
 
 def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
-    """Calibrate by RANSAC, then Levenberg-Marquardt on the inliers.
-
-    Args:
-        pairs: N pose pairs.
-        seed: of the random triples.
+    """Calibrate by RANSAC, with a seed of its random triples, then Levenberg-Marquardt on the inliers.
 
     Raises:
         CalibrationError: with fewer than three pose pairs, without rotation, or if no solution explains three of them.
@@ -224,57 +219,7 @@ class _Weighted:
 
     def costs(self, R: Float, t: Float, limit: float) -> Float:
         """Sum the `distances`, each up to a limit: (M,) for M solutions."""
-        return _costs(R, t, *self.parts, self._covariance_1, self._covariance_2, limit)
-
-
-@kernel
-def _costs(
-    R: Float,
-    t: Float,
-    R_1: Float,
-    T_1: Float,
-    R_2: Float,
-    T_2: Float,
-    covariance_1: Float,
-    covariance_2: Float,
-    limit: float,
-) -> Float:
-    """Sum the squared Mahalanobis distances of the alignment errors, as `_Weighted.costs` describes."""
-    costs, jacobian, root, error = np.zeros(len(R)), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
-    for m in range(len(R)):
-        for n in range(len(R_1)):
-            for i in range(3):
-                # eq. (7), and its derivative with respect to the first motion: [-R_1^T skew(t), R_1^T]
-                error[i] = -t[m, i]
-                for j in range(3):
-                    moved = R_2[n, 0, j] * T_2[n, 0] + R_2[n, 1, j] * T_2[n, 1] + R_2[n, 2, j] * T_2[n, 2]
-                    error[i] += R[m, j, i] * moved + R_1[n, j, i] * (t[m, j] - T_1[n, j])
-                    jacobian[i, 3 + j] = R_1[n, j, i]
-                jacobian[i, 0] = R_1[n, 2, i] * t[m, 1] - R_1[n, 1, i] * t[m, 2]
-                jacobian[i, 1] = R_1[n, 0, i] * t[m, 2] - R_1[n, 2, i] * t[m, 0]
-                jacobian[i, 2] = R_1[n, 1, i] * t[m, 0] - R_1[n, 0, i] * t[m, 1]
-            for i in range(3):
-                for j in range(i + 1):
-                    total = 0.0
-                    for a in range(6):
-                        for b in range(6):
-                            total += jacobian[i, a] * covariance_1[n, a, b] * jacobian[j, b]
-                    for a in range(3):
-                        for b in range(3):
-                            total += R[m, a, i] * covariance_2[n, a, b] * R[m, b, j]
-                    root[i, j] = total
-            distance = 0.0
-            for i in range(3):  # Cholesky's root, and the error divided by it
-                for j in range(i + 1):
-                    for a in range(j):
-                        root[i, j] -= root[i, a] * root[j, a]
-                    root[i, j] = np.sqrt(root[i, i]) if i == j else root[i, j] / root[j, j]
-                for a in range(i):
-                    error[i] -= root[i, a] * error[a]
-                error[i] /= root[i, i]
-                distance += error[i] * error[i]
-            costs[m] += min(distance, limit)
-    return costs
+        return np.array([np.minimum(self.distances(*each), limit).sum() for each in zip(R, t, strict=True)])
 
 
 def _best_triples(weighted: _Weighted, rng: np.random.Generator) -> list[tuple[Float, Float]]:

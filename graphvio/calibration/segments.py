@@ -45,10 +45,9 @@ class Segments:
         """J."""
         return int(self.known.shape[1])
 
-    def select(self, rows: Bool | Int | Sequence[int]) -> Segments:
+    def select(self, rows: Bool | Int) -> Segments:
         """Return some of the segments, by mask or indices."""
-        which = np.asarray(rows, dtype=None if isinstance(rows, np.ndarray) else np.int64)
-        return Segments(*(getattr(self, field.name)[which] for field in fields(self)))
+        return Segments(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def of_both(self, one: int, other: int) -> Segments:
         """Return the segments over which two cameras know their motions, of these two cameras in this order."""
@@ -104,7 +103,7 @@ def segment_ends(stamps_ns: Int) -> tuple[Int, Int]:
     return first[within], ends[within]
 
 
-def of_one_length(segments: Segments) -> list[int]:
+def of_one_length(segments: Segments) -> Int:
     """Return indices of segments of about a third of a second, one after the other, for a first solution."""
     duration = (segments.end_ns - segments.start_ns) / _NS_PER_S
     nearest: dict[int, int] = {}
@@ -117,7 +116,7 @@ def of_one_length(segments: Segments) -> list[int]:
         if i >= free:
             chosen.append(nearest[i])
             free = int(segments.last[nearest[i]])
-    return chosen
+    return np.array(chosen, dtype=np.int64)
 
 
 def information_gains(pairs: PosePairs, left2_T_left1: Float, covariance: Float) -> Float:
@@ -129,7 +128,7 @@ def information_gains(pairs: PosePairs, left2_T_left1: Float, covariance: Float)
     return np.asarray(np.einsum("nki,ij,nkj->n", jacobians, covariance, jacobians))
 
 
-def most_informative(segments: Segments, gains: Float) -> list[int]:
+def most_informative(segments: Segments, gains: Float) -> Int:
     """Return indices, in order of time, of the segments that do not overlap with the largest sum of gains (N,)."""
     ending: dict[int, list[int]] = {}
     for row, j in enumerate(segments.last.tolist()):
@@ -153,4 +152,4 @@ def most_informative(segments: Segments, gains: Float) -> list[int]:
         else:
             chosen.append(ended)
             j = first[ended]
-    return chosen[::-1]
+    return np.array(chosen[::-1], dtype=np.int64)

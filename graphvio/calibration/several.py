@@ -51,12 +51,7 @@ class CameraExtrinsics:
 def pairwise(
     names: Sequence[str], calibrate: Callable[[int, int, ScaleMode], PairCalibration], scale_mode: ScaleMode
 ) -> tuple[dict[tuple[int, int], PairCalibration], list[str]]:
-    """Calibrate all cameras, two at a time.
-
-    Args:
-        names: of J cameras.
-        calibrate: function that calibrates two cameras.
-        scale_mode: see `calibrate_pair`; where one scale is significantly wrong, all are estimated.
+    """Calibrate all cameras, two at a time; where one scale is significantly wrong, all are estimated.
 
     Returns:
         (first, second) -> result, and a sentence on each result that is missing.

@@ -58,20 +58,14 @@ class TwoTrajectories:
 
 
 def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: int = 0) -> TwoTrajectories:
-    """Alternate between the relation of the clocks, the noise and the relative pose.
-
-    Args:
-        one: of the first camera, in any world frame.
-        other: of the second camera, in any world frame.
-        same_clock: whether both have one clock, so that there is no relation to estimate.
-        seed: of the random triples.
+    """Alternate between the relation of the clocks, unless both have one, the noise and the relative pose.
 
     Raises:
         CalibrationError: if no offset makes their angular speeds agree, or no relative pose explains their motions.
     """
     clock = first_relation(one, other, same_clock)
     segments = segments_of([one, other], [clock])
-    rows = np.array(of_one_length(segments), dtype=np.int64)
+    rows = of_one_length(segments)
     pose = paper_method.calibrate(segments.pairs.select(rows), seed).left2_T_left1
     for _ in range(_ROUNDS):
         segments = _with_noise(segments, pose)
@@ -81,7 +75,7 @@ def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: 
         if nuisances is not None:
             clock = clock.corrected(*found.nuisances.tolist())
             segments = segments_of([one, other], [clock])
-            rows = np.array(of_one_length(segments), dtype=np.int64)
+            rows = of_one_length(segments)
     segments = _long_enough(_with_noise(segments, pose))
     nuisances = None if same_clock else _clock_nuisances(one, other, clock, segments, pose)
     return TwoTrajectories(segments, clock, nuisances)

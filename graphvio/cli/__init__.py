@@ -9,7 +9,7 @@ import typer
 from graphvio.cli.benchmark import benchmark
 from graphvio.cli.calibrate import calibrate, calibrate_trajectories
 from graphvio.cli.compare import compare
-from graphvio.cli.doctor import doctor
+from graphvio.cli.doctor import check_requirements, doctor
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
 from graphvio.cli.info import dump_config, info
@@ -18,7 +18,6 @@ from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.output import lasting_streams
 from graphvio.cli.record import convert, record
-from graphvio.cli.requirements import check_requirements
 from graphvio.cli.rig import rig
 from graphvio.cli.run import run
 from graphvio.cli.serve import serve

@@ -83,11 +83,13 @@ def calibrate(
         graphvio calibrate walk --what all --out rig-calibrated.yaml --report calibration
     """
     from graphvio.calibration.calibrate import calibrate_pairs
+    from graphvio.calibration.report.document import write_document
     from graphvio.cli.calibrate_rig import calibrate_rig
     from graphvio.cli.calibration_progress import CalibrationProgress
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
+    from graphvio.rig_files import save_rig
     from graphvio.runtime import set_up_threads
 
     _check_outputs(out, report, [] if rig is None else [rig])
@@ -107,22 +109,6 @@ def calibrate(
     names = [pair.name for pair in opened.rig.pairs]
     with CalibrationProgress(opened.frameset_count, names if guide else None) as progress:
         found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=progress.on_frameset)
-    _deliver(found, out, report, opened.name, progress.framesets, correct_imu=correct_imu)
-
-
-def _deliver(
-    found: Calibration,
-    out: Path | None,
-    report: Path | None,
-    name: str,
-    framesets: int,
-    *,
-    correct_imu: bool,
-) -> None:
-    """Print where the pairs are, write what is asked for, and say by the exit code whether all of it is known."""
-    from graphvio.calibration.report.document import write_document
-    from graphvio.rig_files import save_rig
-
     _print_result(found)
     if out is not None:
         numbers = out.with_suffix(".calibration.yaml")
@@ -132,7 +118,7 @@ def _deliver(
             typer.echo(f"wrote {out}, and all numbers to {numbers}")
         else:
             warn(f"{out} is not written, only {numbers}: the motions determine a part only")
-    _finish(found, report, name, framesets)
+    _finish(found, report, opened.name, progress.framesets)
 
 
 def calibrate_trajectories(
@@ -201,15 +187,14 @@ def _working(text: str) -> AbstractContextManager[object]:
 
 
 def _scale_mode(text: str) -> ScaleMode:
-    from typing import get_args
+    from typing import cast, get_args
 
     from graphvio.calibration.nuisances import ScaleMode
     from graphvio.errors import ConfigError
 
-    for mode in get_args(ScaleMode):
-        if text == mode:
-            return mode  # type: ignore[no-any-return]
-    raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
+    if text not in get_args(ScaleMode):
+        raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
+    return cast(ScaleMode, text)
 
 
 def _check_outputs(out: Path | None, report: Path | None, inputs: list[Path]) -> None:

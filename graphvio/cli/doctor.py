@@ -1,4 +1,4 @@
-"""``graphvio doctor``: what is installed on this machine."""
+"""``graphvio doctor``: what is installed on this machine, and the check of what no command runs without."""
 
 import os
 import platform
@@ -9,7 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from graphvio.cli.json_output import publish
-from graphvio.cli.requirements import REQUIRED
+from graphvio.errors import MissingRequirementError
+
+REQUIRED = {
+    "gtsam": "gtsam",
+    "numpy": "numpy",
+    "numba": "numba",
+    "scipy": "scipy",
+    "cv2": "opencv-python-headless",
+    "matplotlib": "matplotlib",
+    "yaml": "pyyaml",
+    "isal": "isal",
+    "jinja2": "jinja2",
+    "rich": "rich",
+}
+"""Module -> the package that has it."""
 
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
 _OPTIONAL = {
@@ -24,6 +38,17 @@ _OPTIONAL = {
     "ros2": ("cyclonedds", "cyclonedds", "ROS 2 topics"),
     "serve": ("grpc", "grpcio", "gRPC"),
 }
+
+
+def check_requirements() -> None:
+    """Check that all are there, before hours of work end at a plot.
+
+    Raises:
+        MissingRequirementError: if one is not.
+    """
+    absent = [package for module, package in REQUIRED.items() if find_spec(module) is None]
+    if absent:
+        raise MissingRequirementError(absent)
 
 
 def doctor() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from graphvio.fleet.run import FleetProgress
-    from graphvio.fleet.table import Outcome
 
 _Scheduler = Annotated[
     str | None,
@@ -118,21 +117,14 @@ def optimize(
                 task, completed=progress.optimized + progress.failed, description=_description(progress)
             ),
         )
-    if not _print_outcomes(outcomes, out):
-        raise typer.Exit(EXIT_INCOMPLETE)
-
-
-def _print_outcomes(outcomes: Sequence[Outcome], out: str) -> bool:
-    """Print how each session ended, and return whether none failed."""
-    from dataclasses import asdict
-
     publish({"results": out, "sessions": [asdict(each) | {"status": each.status} for each in outcomes]})
     failed = [each for each in outcomes if each.error]
     for each in failed:
         warn(f"{each.name} failed in {each.failed_in}: {each.error}")
     typer.echo(f"{len(outcomes) - len(failed)} of {len(outcomes)} sessions optimised")
     typer.echo(f"results: {out}")
-    return not failed
+    if failed:
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def _bars() -> Progress:

@@ -14,7 +14,7 @@ from graphvio.cli.shared import check_scene
 
 if TYPE_CHECKING:
     from graphvio.sessions.stamps import Clock
-    from graphvio.sources.description import Regularity, Synchronisation, TopicDescription
+    from graphvio.sources.description import Regularity, Synchronisation
 
 
 def info(
@@ -65,7 +65,9 @@ def _show_session(path: Path, rig: Path | None) -> None:
         typer.echo(f"written by {found.library}")
     typer.echo(f"rig: {found.rig or 'none inside; give one with --rig'}")
     for topic in found.topics:
-        typer.echo(f"{topic.name}  ({topic.type_name}): {topic.messages} messages{_topic_regularity(topic)}")
+        regularity = "" if topic.regularity is None else _regularity(topic.regularity)
+        clock = "" if topic.regularity is None or topic.clock is None else _clock(topic.clock)
+        typer.echo(f"{topic.name}  ({topic.type_name}): {topic.messages} messages{regularity}{clock}")
     for each in found.synchronisation:
         typer.echo(_synchronised(each))
 
@@ -105,12 +107,6 @@ def dump_config(
     settings = Config.load(profile)
     publish(settings)
     typer.echo(settings.to_yaml(), nl=False)
-
-
-def _topic_regularity(topic: TopicDescription) -> str:
-    if topic.regularity is None:
-        return ""
-    return _regularity(topic.regularity) + ("" if topic.clock is None else _clock(topic.clock))
 
 
 def _regularity(found: Regularity) -> str:

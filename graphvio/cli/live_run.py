@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from graphvio.cli.dashboard import Dashboard, Figures, line_of, summary_of
+from graphvio.cli.dashboard import Dashboard, line_of, summary_of
 from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, reading_of, warn
 from graphvio.cli.warming import warm_up_visibly
@@ -36,42 +36,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions:
-    """What a live run is asked for.
+    """What a live run is asked for."""
 
-    Attributes:
-        source: ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path.
-        rig: rig or calibration file, or None for what the source carries.
-        config: profile, or YAML file.
-        cameras: the only cameras to be used, such as ``cam0,cam1``, or None for all.
-        no_pairs: whether cameras are used without their partners.
-        record: session to be written, or None.
-        png: whether its images are compressed.
-        view: whether the viewer's window opens.
-        health_port: port of health and metrics, or None for none.
-        duration_s: the run ends after so many seconds, or with the source if None.
-        forget_calibration: whether what earlier runs learnt of the calibration is forgotten.
-        services: for other programs, or None.
-    """
-
-    source: str
-    rig: Path | None
-    config: str
-    cameras: str | None
-    no_pairs: bool
-    record: Path | None
-    png: bool
-    view: bool
-    health_port: int | None
-    duration_s: float | None
-    forget_calibration: bool
-    services: Services | None
+    source: str  # ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path
+    rig: Path | None  # rig or calibration file, or None for what the source carries
+    config: str  # profile, or YAML file
+    cameras: str | None  # the only cameras to be used, such as ``cam0,cam1``, or None for all
+    no_pairs: bool  # whether cameras are used without their partners
+    record: Path | None  # session to be written, or None
+    png: bool  # whether its images are compressed
+    view: bool  # whether the viewer's window opens
+    health_port: int | None  # port of health and metrics, or None for none
+    duration_s: float | None  # the run ends after so many seconds, or with the source if None
+    forget_calibration: bool  # whether what earlier runs learnt of the calibration is forgotten
+    services: Services | None  # for other programs, or None
 
 
 def run_live(options: LiveOptions) -> None:
     """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
     _check_recording(options)
     share_heap()
-    config = _config_of(options)
+    config = Config.load(options.config)
+    if options.services is not None:
+        config = options.services.settings(config)
     source = _source_of(options)
     if options.services is not None:
         options.services.check()
@@ -86,16 +73,31 @@ def run_live(options: LiveOptions) -> None:
         stack.callback(running.stop)
         if viewer is not None:
             running.add_output(ViewOutput(viewer, lambda: running.odometry.calibration))
-        _serve_health(stack, running, options)
-        started = _start_services(stack, running, signals, options)
-        recorder = _record(recording, running, source, options)  # last: a port in use leaves no file behind
+        if options.health_port is not None:
+            health = HealthServer(running.status, port=options.health_port)
+            stack.callback(health.close)
+            typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
+        started = None
+        if options.services is not None:
+            started = options.services.start(running, stack, lambda: signals.came)
+            for line in started.lines:
+                typer.echo(line, err=True)
+        recorder = None
+        if options.record is not None:  # last: a port in use leaves no file behind
+            image_format: ImageFormat = "png" if options.png else "raw"
+            recorder = SessionRecorder(options.record, running.rig, image_format, waits=not source.is_realtime)
+            recording.callback(recorder.close)
+            running.add_output(recorder)
         running.start()
         failure = _run_until_end(source.name, running, signals, started, options)
         figures = running.status()
         is_whole = started is None or started.finish()
         if failure is not None:
             raise failure
-    _report(figures, recorder, options)
+    recorded = {} if recorder is None else {"recording": str(options.record), **recorder.status()}
+    publish({**figures, **recorded})
+    typer.echo(line_of(figures))
+    typer.echo(summary_of(figures))
     if memory is not None and figures.get("status_tracking"):
         _keep(memory, running)
     if recorder is not None and options.record is not None:
@@ -122,12 +124,6 @@ def _check_recording(options: LiveOptions) -> None:
         raise exists_error(path)
     if not path.parent.is_dir():
         raise SessionError(f"{path}: {path.parent} is no folder; make it first")
-
-
-def _config_of(options: LiveOptions) -> Config:
-    """Load the configuration, with what the services need."""
-    config = Config.load(options.config)
-    return config if options.services is None else options.services.settings(config)
 
 
 def _source_of(options: LiveOptions) -> LiveSource:
@@ -205,85 +201,32 @@ def _viewer(stack: ExitStack, rig: Rig, options: LiveOptions) -> Viewer | None:
     return viewer
 
 
-def _serve_health(stack: ExitStack, running: LiveOdometry, options: LiveOptions) -> None:
-    """Serve health and metrics, if they are asked for, until the stack closes."""
-    if options.health_port is None:
-        return
-    health = HealthServer(running.status, port=options.health_port)
-    stack.callback(health.close)
-    typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
-
-
-def _start_services(
-    stack: ExitStack, running: LiveOdometry, signals: StopSignals, options: LiveOptions
-) -> Started | None:
-    """Start the services for other programs, if they are asked for, until the stack closes."""
-    if options.services is None:
-        return None
-    started = options.services.start(running, stack, lambda: signals.came)
-    for line in started.lines:
-        typer.echo(line, err=True)
-    return started
-
-
-def _record(
-    stack: ExitStack, running: LiveOdometry, source: LiveSource, options: LiveOptions
-) -> SessionRecorder | None:
-    """Record the run, if that is asked for, until the stack closes."""
-    if options.record is None:
-        return None
-    image_format: ImageFormat = "png" if options.png else "raw"
-    recorder = SessionRecorder(options.record, running.rig, image_format, waits=not source.is_realtime)
-    stack.callback(recorder.close)
-    running.add_output(recorder)
-    return recorder
-
-
 # ---------------------------------------------------------------------- the run, and what is said and kept at its end
 
 
 def _run_until_end(
     name: str, running: LiveOdometry, signals: StopSignals, started: Started | None, options: LiveOptions
 ) -> Exception | None:
-    """Run until the source has ended, a signal came, or the time is over.
+    """Run, and show what happens, until the source has ended, a signal came, a service failed, or the time is over.
 
     Returns:
         The error by which it ended, to be raised after everything until then is saved; None if there was none.
     """
+    until = None if options.duration_s is None else monotonic() + options.duration_s
     try:
-        _show_until_end(name, running, signals, options.duration_s, started)
+        with Dashboard(name, running.events.subscribe(64)) as dashboard:
+            while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
+                dashboard.show(running.status(), running.devices)
+                if started is not None:
+                    started.check()
+        if signals.came:
+            typer.echo("stopping: measurements that have come are processed and saved", err=True)
         running.stop()
     except Exception as error:
         with suppress(Exception):
             running.stop()
         return error
     return None
-
-
-def _show_until_end(
-    name: str, running: LiveOdometry, signals: StopSignals, duration_s: float | None, started: Started | None
-) -> None:
-    """Show what happens until the source has ended, a signal came, or the time is over.
-
-    Raises:
-        GraphvioError: that of a service which failed.
-    """
-    until = None if duration_s is None else monotonic() + duration_s
-    with Dashboard(name, running.events.subscribe(64)) as dashboard:
-        while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
-            dashboard.show(running.status(), running.devices)
-            if started is not None:
-                started.check()
-    if signals.came:
-        typer.echo("stopping: measurements that have come are processed and saved", err=True)
-
-
-def _report(figures: Figures, recorder: SessionRecorder | None, options: LiveOptions) -> None:
-    """Print the figures of a run, and publish them with those of its recording."""
-    recorded = {} if recorder is None else {"recording": str(options.record), **recorder.status()}
-    publish({**figures, **recorded})
-    typer.echo(line_of(figures))
-    typer.echo(summary_of(figures))
 
 
 def _keep(memory: CalibrationMemory, running: LiveOdometry) -> None:

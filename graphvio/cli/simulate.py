@@ -124,16 +124,11 @@ def simulate(
 
 
 def _check_names(rig: Rig, file: str) -> None:
-    """Refuse names of cameras that the EuRoC/ASL layout does not have.
-
-    Raises:
-        RigError: if there is one.
-    """
+    """Refuse names of cameras that the EuRoC/ASL layout does not have."""
     from graphvio.errors import RigError
 
     names = [camera.name for camera in rig.cameras]
-    wrong = [name for name in names if not (name.startswith("cam") and name[3:].isdecimal())]
-    if wrong or "cam0" not in names:
+    if "cam0" not in names or not all(name.startswith("cam") and name[3:].isdecimal() for name in names):
         raise RigError(
             f"{file}: cameras are called {', '.join(names)}; the EuRoC/ASL layout wants cam0, cam1, ...: rename them"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from contextlib import ExitStack
 
     from graphvio.live.running import LiveOdometry
+    from graphvio.mapping.process import MappingTask
 
 
 def slam(
@@ -64,10 +65,9 @@ def slam(
     if save_rrd is not None and save_rrd.exists():
         raise MapError(f"{save_rrd}: exists; name another file for --save-rrd")
     from graphvio.cli.live_run import LiveOptions, run_live
+    from graphvio.mapping.process import MappingTask
 
-    services = _WithMapping(
-        ServiceOptions(port=0), ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
-    )
+    task = MappingTask(saved_map, out, view, web, save_rrd)
     run_live(
         LiveOptions(
             source=source,
@@ -81,7 +81,7 @@ def slam(
             health_port=health_port,
             duration_s=duration,
             forget_calibration=forget_calibration,
-            services=services,
+            services=_WithMapping(ServiceOptions(port=0), ros2, task=task),
         )
     )
 
@@ -90,38 +90,25 @@ def slam(
 class _WithMapping(Services):
     """gRPC on this machine, ROS 2 topics where asked for, and the SLAM as a client of gRPC."""
 
-    saved_map: Path | None = None  # folder of the map to extend, or None
-    out: Path | None = None  # folder for the map, or None
-    view: bool = False  # whether the viewer's window opens
-    map_web_port: int | None = None  # port of the page for browsers, or None
-    save_rrd: Path | None = None  # file for the viewer's recording, or None
+    task: MappingTask = field(kw_only=True)  # of the SLAM
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
         """Serve the odometry, and start the SLAM; see `Services.start`."""
         from graphvio.cli.slam_process import SlamProcess
         from graphvio.live.outputs import PathOutput
-        from graphvio.mapping.process import MappingTask
         from graphvio.viewer import WebOptions
 
         served = super().start(running, stack, is_stopped)
-        task = MappingTask(
-            served.address,
-            running.odometry.config,
-            self.saved_map,
-            self.out,
-            self.view,
-            self.map_web_port,
-            self.save_rrd,
-        )
+        task = replace(self.task, address=served.address, config=running.odometry.config)
         path = PathOutput(lambda: running.map_T_odom)
-        if self.out is not None:
+        if task.out is not None:
             running.add_output(path)
         process = SlamProcess(task, path)
         stack.callback(process.close)
         process.wait_ready(is_stopped)
         lines = list(served.lines)
-        if self.map_web_port is not None:
-            lines.append(f"browser: {WebOptions(port=self.map_web_port).url}")
+        if task.web_port is not None:
+            lines.append(f"browser: {WebOptions(port=task.web_port).url}")
 
         def check() -> None:
             served.check()

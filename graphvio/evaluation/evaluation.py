@@ -59,53 +59,29 @@ class LoopClosureError:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Error of an estimate against the truth; the module defines each figure.
+    """Error of an estimate against the truth; the module defines each figure."""
 
-    Attributes:
-        associated: number of estimates that have a true pose.
-        estimates: number of all estimates.
-        duration_s: from the first to the last associated stamp.
-        path_length_m: of the truth in between.
-        ate_position_m: metres.
-        ate_rotation_deg: degrees.
-        ate_percent: ATE rmse in percent of the path; None for paths under 0.1 m.
-        scale_error_percent: of the estimate's lengths; None for paths under 0.1 m.
-        ate_scaled_m: ATE rmse of position after alignment with scale; None for paths under 0.1 m.
-        drift_m: position error at the end with the start aligned.
-        drift_percent: the same in percent of the path; None for paths under 0.1 m.
-        loop_closure: None where the truth does not return to its start.
-        rpe: ``1 s``, ``1 m``, ``5 m``... -> error, for distances within the path's length.
-        kitti_percent: mean over all segments of 100 to 800 m, or None.
-        kitti_deg_per_m: mean over all segments of 100 to 800 m, or None.
-        truth_T_nav: (4, 4) alignment of the ATE.
-        stamps_ns: (associated,) stamps.
-        position_error_m: (associated,) after alignment.
-        rotation_error_deg: (associated,) after alignment.
-        aligned: associated estimates in the truth's frame.
-        truth: truth at the same stamps.
-    """
-
-    associated: int
-    estimates: int
-    duration_s: float
-    path_length_m: float
-    ate_position_m: Stats
-    ate_rotation_deg: Stats
-    ate_percent: float | None
-    scale_error_percent: float | None
-    ate_scaled_m: float | None
-    drift_m: float
-    drift_percent: float | None
-    loop_closure: LoopClosureError | None
-    rpe: Mapping[str, RelativeError]
-    kitti_percent: float | None
-    kitti_deg_per_m: float | None
-    truth_T_nav: Float
-    stamps_ns: Int
-    position_error_m: Float
-    rotation_error_deg: Float
-    aligned: Trajectory
-    truth: Trajectory
+    associated: int  # number of estimates that have a true pose
+    estimates: int  # number of all estimates
+    duration_s: float  # from the first to the last associated stamp
+    path_length_m: float  # of the truth in between
+    ate_position_m: Stats  # metres
+    ate_rotation_deg: Stats  # degrees
+    ate_percent: float | None  # ATE rmse in percent of the path; None for paths under 0.1 m
+    scale_error_percent: float | None  # of the estimate's lengths; None for paths under 0.1 m
+    ate_scaled_m: float | None  # ATE rmse of position after alignment with scale; None for paths under 0.1 m
+    drift_m: float  # position error at the end with the start aligned
+    drift_percent: float | None  # the same in percent of the path; None for paths under 0.1 m
+    loop_closure: LoopClosureError | None  # None where the truth does not return to its start
+    rpe: Mapping[str, RelativeError]  # ``1 s``, ``1 m``, ``5 m``... -> error, for distances within the path's length
+    kitti_percent: float | None  # mean over all segments of 100 to 800 m, or None
+    kitti_deg_per_m: float | None  # mean over all segments of 100 to 800 m, or None
+    truth_T_nav: Float  # (4, 4) alignment of the ATE
+    stamps_ns: Int  # (associated,) stamps
+    position_error_m: Float  # (associated,) after alignment
+    rotation_error_deg: Float  # (associated,) after alignment
+    aligned: Trajectory  # associated estimates in the truth's frame
+    truth: Trajectory  # truth at the same stamps
 
     def as_dict(self) -> dict[str, Any]:
         """Convert all figures, without the series, to values of JSON."""
@@ -143,7 +119,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
     path_m = float(at_estimates.distances[-1])
     drift_m = _drift(used, at_estimates)
     rpe, kitti = relative_errors(used, at_estimates)
-    scale = align_scale(aligned.positions, at_estimates.positions) if path_m >= _MIN_PATH_M else None
+    scaled = align_scale(aligned.positions, at_estimates.positions) if path_m >= _MIN_PATH_M else (None, None)
     return Evaluation(
         associated=len(used),
         estimates=len(estimate),
@@ -152,8 +128,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
         ate_position_m=(ate := Stats.of(position_m)),
         ate_rotation_deg=Stats.of(rotation_deg),
         ate_percent=_percent(ate.rmse, path_m),
-        scale_error_percent=None if scale is None else scale.error_percent,
-        ate_scaled_m=None if scale is None else scale.rmse_m,
+        scale_error_percent=scaled[0],
+        ate_scaled_m=scaled[1],
         drift_m=drift_m,
         drift_percent=_percent(drift_m, path_m),
         loop_closure=_loop_closure(aligned, at_estimates, path_m),
@@ -171,19 +147,12 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
 
 @dataclass(frozen=True)
 class Compared:
-    """One of several results that are compared.
+    """One of several results that are compared."""
 
-    Attributes:
-        name: of the result.
-        evaluation: against the truth, or None where that failed.
-        why_not: reason of the failure, or empty.
-        ate_ratio: ATE rmse of position relative to the first result that could be evaluated.
-    """
-
-    name: str
-    evaluation: Evaluation | None
-    why_not: str
-    ate_ratio: float | None
+    name: str  # of the result
+    evaluation: Evaluation | None  # against the truth, or None where that failed
+    why_not: str  # reason of the failure, or empty
+    ate_ratio: float | None  # ATE rmse of position relative to the first result that could be evaluated
 
     @property
     def ate_m(self) -> float:
@@ -194,14 +163,7 @@ class Compared:
 def compare(
     names: Sequence[str], results: Sequence[Trajectory], truth: Trajectory, max_gap_s: float = MAX_GAP_S
 ) -> list[Compared]:
-    """Evaluate several results against the same truth; one that fails does not affect the others.
-
-    Args:
-        names: of the N results.
-        results: N trajectories of body.
-        truth: see `evaluate`.
-        max_gap_s: see `evaluate`.
-    """
+    """Evaluate several results against the same truth, see `evaluate`; one that fails does not affect the others."""
     compared: list[Compared] = []
     for name, result in zip(names, results, strict=True):
         try:

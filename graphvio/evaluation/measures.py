@@ -88,15 +88,7 @@ def align_with_rotations(estimate: Trajectory, truth: Trajectory) -> Float:
     return np.asarray(se3(rotation, q_mean - rotation @ p_mean))
 
 
-@dataclass(frozen=True)
-class ScaleAlignment:
-    """The scale of an estimate, and what is left of its error without it."""
-
-    error_percent: float  # by which the estimate's lengths are too long
-    rmse_m: float  # of positions, after alignment with the scale
-
-
-def align_scale(aligned: Float, truth: Float) -> ScaleAlignment | None:
+def align_scale(aligned: Float, truth: Float) -> tuple[float, float] | tuple[None, None]:
     """Compute the scale of Umeyama's Sim(3) alignment, whose rotation is that of the alignment without scale.
 
     Args:
@@ -104,15 +96,16 @@ def align_scale(aligned: Float, truth: Float) -> ScaleAlignment | None:
         truth: (N, 3) true positions.
 
     Returns:
-        None where the estimate stays at one place, or its scale would be negative.
+        By how much the estimate's lengths are too long, in percent, and the rmse of positions after alignment with the
+        scale; None where the estimate stays at one place, or its scale would be negative.
     """
     from_mean, true_from_mean = aligned - aligned.mean(axis=0), truth - truth.mean(axis=0)
     along = float((from_mean * true_from_mean).sum())
     if along <= 0.0:
-        return None
+        return None, None
     scale = along / float((from_mean**2).sum())
     left = scale * from_mean - true_from_mean
-    return ScaleAlignment(100.0 * (1.0 / scale - 1.0), float(np.sqrt((left**2).sum(axis=1).mean())))
+    return 100.0 * (1.0 / scale - 1.0), float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def _nearest_rotation(correlation: Float) -> Float:

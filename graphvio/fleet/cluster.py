@@ -57,11 +57,9 @@ def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) 
 
 @contextmanager
 def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any]:
-    """Connect a client of Dask, and disconnect it at the end.
+    """Connect a client to the scheduler at an address, and disconnect it at the end.
 
-    Args:
-        scheduler: address of a running scheduler; None takes a cluster on this machine for the time inside.
-        workers: processes of such a cluster, of one thread each; None takes `default_workers`.
+    Without an address, it is that of a cluster on this machine for the time inside, of so many processes of one thread.
 
     Raises:
         FleetError: if the scheduler cannot be reached, or the cluster cannot be started.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from graphvio.config import Config
-from graphvio.errors import FleetError, GraphvioError
+from graphvio.errors import GraphvioError
 from graphvio.fleet import tasks
 from graphvio.fleet.cluster import RETRIES, compile_kernels, connected, distributed
 from graphvio.fleet.listing import Listed
@@ -233,7 +233,7 @@ def _one_line(error: BaseException) -> str:
         text = "its workers died each time: killed, or out of memory"
     elif isinstance(error, library.client.FutureCancelledError):
         text = "cancelled: the connection to the scheduler was lost, or the scheduler ended"
-    elif isinstance(error, (GraphvioError, FleetError)):
+    elif isinstance(error, GraphvioError):
         text = str(error)
     else:
         text = f"{type(error).__name__}: {error}"

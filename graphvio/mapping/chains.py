@@ -58,7 +58,7 @@ class Chains:
 
     def add(self, previous_T_body: Float, covariance: Float) -> None:
         """Add a place to the last fragment by its motion (4, 4) from the previous place, with covariance (6, 6)."""
-        covariance = _regular(covariance)
+        covariance = np.asarray(0.5 * (covariance + covariance.T) + EXACT)
         pose = self.poses[-1] @ previous_T_body
         adjoint = se3_adjoint(pose)
         n = len(self)
@@ -72,10 +72,6 @@ class Chains:
         adjoint = se3_adjoint(se3_inverse(self.poses[second]))
         covariance = adjoint @ (self._sums[high] - self._sums[low]) @ adjoint.T
         return relative, 0.5 * (covariance + covariance.T)
-
-    def distance(self, edge: Edge) -> float:
-        """Return the squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
-        return edge.distance(*self.motion(edge.first, edge.second))
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
         """Add a fragment's motions as factors to a graph whose variables are the places' indices."""
@@ -103,7 +99,3 @@ class Chains:
         self.covariances.append(covariance)
         self.poses.append(pose)
         self._sums.append(total)
-
-
-def _regular(covariance: Float) -> Float:
-    return np.asarray(0.5 * (covariance + covariance.T) + EXACT)

@@ -74,10 +74,10 @@ class Mapper:
         self._places: list[Place] = []
         self._body_T_camera: list[Float] = []  # of the first camera, by the rig that was in force at each place
         if folder is not None:
-            kept = saved_map.load(folder, self._front_end.rig)
+            kept = saved_map.load(folder, self._front_end.rig, self._config)
             copy_database(folder / DATABASE, self._folder / DATABASE)
-            self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
-            self._body_T_camera = list(kept.body_T_camera)
+            self._graph, self._recognition = kept.graph, kept.recognition
+            self._places, self._body_T_camera = list(kept.places), list(kept.body_T_camera)
         self._first = len(self._places)  # first place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._front_end.rig)
@@ -133,7 +133,7 @@ class Mapper:
             MapError: If the folder contains other files, or cannot be written.
         """
         with self._working, self._lock:
-            kept = saved_map.to_saved(self._graph, self._recognition, self._places, self._body_T_camera)
+            kept = saved_map.SavedMap(self._graph, self._recognition, self._places, self._body_T_camera)
             saved_map.save(kept, self._store, self._front_end.rig, Path(folder))
 
     @property
@@ -183,7 +183,9 @@ class Mapper:
 
     def _take(self, new: NewPlace) -> None:
         keyframe, clock = new.keyframe, self._times
-        self._use(keyframe.calibrated_rig or self._front_end.rig)
+        rig = keyframe.calibrated_rig or self._front_end.rig
+        if rig is not self._store.rig:  # see the place, and stored ones, with the calibration that is in force
+            self._store.rig, self._observer = rig, PlaceObserver(rig, self._config)
         frameset = FrameSet(keyframe.stamp_ns, keyframe.images)
         with clock.stage("features"):
             seen = self._observer.look(frameset)
@@ -220,12 +222,6 @@ class Mapper:
         if self._recognition.is_due:
             with clock.stage("vocabulary"):
                 self._recognition.learn(self._descriptors)
-
-    def _use(self, rig: Rig) -> None:
-        """See the new place, and stored ones, with the calibration that is in force."""
-        if rig is not self._store.rig:
-            self._store.rig = rig
-            self._observer = PlaceObserver(rig, self._config)
 
     def _may(self, earlier: int) -> bool:
         """Return whether a place may be compared with the newest one."""

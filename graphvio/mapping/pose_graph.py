@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -37,9 +38,14 @@ class TestedClosure:
     """A closure between two places of the graph, whose rows are the places' indices."""
 
     closure: LoopClosure  # the closure as it was found
-    edge: Edge  # the closure as a factor
     is_used: bool = False  # whether the solution uses it
     is_refuted: bool = False  # whether it contradicts the odometry alone
+
+    @cached_property
+    def edge(self) -> Edge:
+        """The closure as an edge between two places of the graph."""
+        found = self.closure
+        return Edge(found.reference.row, found.current.row, found.reference_T_current, found.covariance)
 
 
 class PoseGraph:
@@ -106,7 +112,7 @@ class PoseGraph:
 
     def covariance(self, place: int) -> Float:
         """Return a pose's covariance (6, 6) relative to the component's first place, tangent in body."""
-        return self._marginals(self._component_of(place)).pose(place)
+        return self._marginals(self._component_of(place)).variable(x(place))
 
     def may_see(self, one: int, other: int) -> bool:
         """Return whether two places may be near enough to see the same; true for places of different components."""
@@ -124,15 +130,14 @@ class PoseGraph:
         """
         is_new, asks_votes = False, False
         for closure in found:
-            one, other = closure.reference.row, closure.current.row
-            tested = TestedClosure(closure, Edge(one, other, closure.reference_T_current, closure.covariance))
+            one, other, tested = closure.reference.row, closure.current.row, TestedClosure(closure)
             self.closures.append(tested)
             is_inside = self.chains.fragment(one) == self.chains.fragment(other)
-            if is_inside and self.chains.distance(tested.edge) > self._limit:
+            if is_inside and tested.edge.distance(self.chains) > self._limit:
                 tested.is_refuted = True
             elif self._component_of(one) != self._component_of(other):
                 asks_votes = True
-            elif self._marginals(self._component_of(one)).distance(tested.edge) <= self._limit:
+            elif tested.edge.distance(self._marginals(self._component_of(one))) <= self._limit:
                 tested.is_used = is_new = True
             else:
                 self._doubts += 1
@@ -155,7 +160,7 @@ class PoseGraph:
             ends = {self._component_of(each.edge.first), self._component_of(each.edge.second)}
             if each.is_used or each.is_refuted or ends != {root}:
                 continue
-            if self._marginals(root).distance(each.edge) <= self._limit:
+            if each.edge.distance(self._marginals(root)) <= self._limit:
                 each.is_used = taken = True
         return taken
 
@@ -191,7 +196,7 @@ class PoseGraph:
 
     def _fits(self, edge: Edge) -> bool:
         root = self._component_of(edge.first)
-        return root == self._component_of(edge.second) and self._marginals(root).distance(edge) <= self._limit
+        return root == self._component_of(edge.second) and edge.distance(self._marginals(root)) <= self._limit
 
     def _moved(self, joined: Joined) -> Float:
         """Return the poses (N, 4, 4) by the odometry alone, in the components' frames."""

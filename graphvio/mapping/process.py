@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -30,15 +30,15 @@ _VIEWED_EVERY = 3  # places
 
 @dataclass(frozen=True)
 class MappingTask:
-    """Options of the process."""
+    """Options of the process; those that are known only when the odometry runs have defaults."""
 
-    address: str  # address of the odometry's service
-    config: Config  # configuration of the odometry, with the settings of places and closures
     map: Path | None = None  # folder of a saved map to begin with, or None
     out: Path | None = None  # folder for the new map, or None
     view: bool = False  # open rerun's window
     web_port: int | None = None  # port of the view in a browser, or None
     save_rrd: Path | None = None  # file for the viewer's data, or None
+    address: str = ""  # address of the odometry's service
+    config: Config = field(default_factory=Config)  # of the odometry, with the settings of places and closures
     # empty folder for temporary files, removed at the end; None for one in the system's folder
     folder: Path | None = None
 

@@ -12,13 +12,14 @@ import json
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import AnyArray, Bool, Float, Int
+from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, MapError
 from graphvio.mapping.chains import Chains
@@ -26,7 +27,6 @@ from graphvio.mapping.pose_graph import PoseGraph, TestedClosure
 from graphvio.mapping.recognition import Recognition
 from graphvio.mapping.store import DATABASE, PlaceStore
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
-from graphvio.optimization.solver import Edge
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.version import __version__
@@ -35,53 +35,16 @@ FORMAT, VERSION = "graphvio map", 3
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
 _DIGESTED = (_PLACES, _CLOSURES, DATABASE)
 _OWN = (_HEADER, _RIG, *_DIGESTED)
-_COLUMN_OF = {"first_places": "starts"}  # attributes whose columns in the file have another name
 _RIG_TOLERANCE = 1e-9  # a file has all digits; this is rounding
 
 
-@dataclass(frozen=True, eq=False)
-class SavedMap:
-    """N places in F fragments, and L closures.
+class SavedMap(NamedTuple):
+    """What a map consists of."""
 
-    Attributes:
-        session: (N,) number of each place's session.
-        stamp_ns: (N,) stamps.
-        map_T_body: (N, 4, 4) poses, each in its component's frame.
-        body_T_camera: (N, 4, 4) of the first camera in body, as it was calibrated when the place was seen.
-        covariance: (N, 6, 6) of the poses, tangent ``[rotation, translation]`` in body.
-        first_places: (F,) first place of each fragment.
-        component: (F,) the fragment in whose frame each fragment is; 0 is the map's.
-        firsts: (F, 4, 4) poses of the first places in their odom frames.
-        motions: (N, 4, 4) motions from the previous place.
-        motion_covariances: (N, 6, 6) covariances of the motions.
-        words: (W, 128) vocabulary.
-        learnt_from: Number of places from which it was learnt.
-        vectors: (M, D) vectors of the places' images.
-        vector_place: (M,) place of each vector.
-        vector_pair: (M,) pair of each vector.
-        closures: All closures that were found.
-        is_used: (L,) whether the solution uses each closure.
-        is_refuted: (L,) whether each closure contradicts the odometry.
-    """
-
-    session: Int
-    stamp_ns: Int
-    map_T_body: Float
-    body_T_camera: Float
-    covariance: Float
-    first_places: Int
-    component: Int
-    firsts: Float
-    motions: Float
-    motion_covariances: Float
-    words: AnyArray
-    learnt_from: int
-    vectors: AnyArray
-    vector_place: Int
-    vector_pair: Int
-    closures: list[LoopClosure]
-    is_used: Bool
-    is_refuted: Bool
+    graph: PoseGraph
+    recognition: Recognition
+    places: Sequence[Place]  # those of the graph, and possibly one more
+    body_T_camera: Sequence[Float]  # (4, 4) of the first camera, as it was calibrated when each place was seen
 
 
 def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
@@ -112,8 +75,13 @@ def check_map(folder: Path) -> None:
     _header(folder)
 
 
-def load(folder: Path, rig: Rig) -> SavedMap:
+def load(folder: Path, rig: Rig, config: Config) -> SavedMap:
     """Read a map.
+
+    Args:
+        folder: that a map was saved in.
+        rig: of the session that is to be located in it.
+        config: of places and closures.
 
     Raises:
         MapError: If the folder contains no map, one of another version or rig, or a damaged one.
@@ -133,11 +101,8 @@ def load(folder: Path, rig: Rig) -> SavedMap:
             raise MapError(f"{folder / name}: is damaged or missing; restore the map from a copy, or make a new one")
     try:
         with np.load(folder / _PLACES, allow_pickle=False) as file:
-            attributes = {column: name for name, column in _COLUMN_OF.items()}
-            columns = {attributes.get(name, name): file[name] for name in file.files}
-        columns["vectors"] = columns["vectors"].astype(np.float32)
-        learnt_from = int(columns.pop("learnt_from"))
-        return SavedMap(**columns, learnt_from=learnt_from, closures=load_closures(folder / _CLOSURES))
+            columns = {name: file[name] for name in file.files}
+        return _restored(columns, load_closures(folder / _CLOSURES), config)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, GraphvioError) as error:
         raise MapError(f"{folder / _PLACES}: holds no places ({error}); restore the map from a copy") from None
 
@@ -148,77 +113,69 @@ def check_target(folder: Path) -> None:
         raise MapError(f"{folder}: contains other files than a map; name another folder")
 
 
-def to_saved(
-    graph: PoseGraph, recognition: Recognition, places: Sequence[Place], body_T_camera: Sequence[Float]
-) -> SavedMap:
-    """Return the map with the places that the graph contains."""
-    chains, closures, n = graph.chains, graph.closures, len(graph)
+def _columns(kept: SavedMap) -> dict[str, Any]:
+    """Return the columns of ``map.npz`` for N places in F fragments, M images of them, and L closures."""
+    graph, recognition, chains, n = kept.graph, kept.recognition, kept.graph.chains, len(kept.graph)
     pairs = [recognition.pairs(place) for place in range(n)]
-    size = recognition.words.size
-    return SavedMap(
-        session=np.array([place.session for place in places[:n]], dtype=np.int64),
-        stamp_ns=np.array([place.stamp_ns for place in places[:n]], dtype=np.int64),
-        map_T_body=np.array([graph.pose(k) for k in range(n)]).reshape(-1, 4, 4),
-        body_T_camera=np.array(body_T_camera[:n]).reshape(-1, 4, 4),
-        covariance=np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
-        first_places=np.array(chains.first_places, dtype=np.int64),
-        component=np.array(graph.component, dtype=np.int64),
-        firsts=np.array([chains.poses[place] for place in chains.first_places]).reshape(-1, 4, 4),
-        motions=np.array(chains.motions).reshape(-1, 4, 4),
-        motion_covariances=np.array(chains.covariances).reshape(-1, 6, 6),
-        words=recognition.words,
-        learnt_from=recognition.learnt_from,
-        vectors=np.concatenate([np.zeros((0, size)), *(recognition.vectors(place) for place in range(n))]),
-        vector_place=np.repeat(np.arange(n), [len(each) for each in pairs]),
-        vector_pair=np.concatenate([np.zeros(0, dtype=np.int64), *pairs]),
-        closures=[each.closure for each in closures],
-        is_used=np.array([each.is_used for each in closures], dtype=bool),
-        is_refuted=np.array([each.is_refuted for each in closures], dtype=bool),
-    )
+    vectors = [np.zeros((0, recognition.words.size)), *(recognition.vectors(place) for place in range(n))]
+    return {
+        "session": np.array([place.session for place in kept.places[:n]], dtype=np.int64),  # (N,)
+        "stamp_ns": np.array([place.stamp_ns for place in kept.places[:n]], dtype=np.int64),  # (N,)
+        # (N, 4, 4) poses, each in its component's frame, and their covariances (N, 6, 6), tangent in body
+        "map_T_body": np.array([graph.pose(k) for k in range(n)]).reshape(-1, 4, 4),
+        "body_T_camera": np.array(kept.body_T_camera[:n]).reshape(-1, 4, 4),
+        "covariance": np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
+        "starts": np.array(chains.first_places, dtype=np.int64),  # (F,) first place of each fragment
+        "component": np.array(graph.component, dtype=np.int64),  # (F,)
+        "firsts": np.array([chains.poses[place] for place in chains.first_places]).reshape(-1, 4, 4),  # in odom
+        # from the previous place
+        "motions": np.array(chains.motions).reshape(-1, 4, 4),
+        "motion_covariances": np.array(chains.covariances).reshape(-1, 6, 6),
+        "words": recognition.words,
+        "learnt_from": np.array(recognition.learnt_from),
+        "vectors": np.concatenate(vectors).astype(np.float16),  # (M, D); sufficient for their ranking
+        "vector_place": np.repeat(np.arange(n), [len(each) for each in pairs]),  # (M,)
+        "vector_pair": np.concatenate([np.zeros(0, dtype=np.int64), *pairs]),  # (M,)
+        "is_used": np.array([each.is_used for each in graph.closures], dtype=bool),  # (L,)
+        "is_refuted": np.array([each.is_refuted for each in graph.closures], dtype=bool),  # (L,)
+    }
 
 
-def restored(kept: SavedMap, config: Config) -> tuple[PoseGraph, Recognition, list[Place]]:
-    """Restore the graph, the recognition and the places of a map."""
-    chains = Chains.of(kept.first_places.tolist(), kept.firsts, kept.motions, kept.motion_covariances)
+def _restored(columns: Mapping[str, AnyArray], found: Sequence[LoopClosure], config: Config) -> SavedMap:
+    """Restore a map from the columns that `_columns` made, and its closures."""
+    motions, covariances = columns["motions"], columns["motion_covariances"]
+    chains = Chains.of(columns["starts"].tolist(), columns["firsts"], motions, covariances)
     closures = [
-        TestedClosure(
-            each,
-            Edge(each.reference.row, each.current.row, each.reference_T_current, each.covariance),
-            bool(is_used),
-            bool(is_refuted),
-        )
-        for each, is_used, is_refuted in zip(kept.closures, kept.is_used, kept.is_refuted, strict=True)
+        TestedClosure(each, bool(is_used), bool(is_refuted))
+        for each, is_used, is_refuted in zip(found, columns["is_used"], columns["is_refuted"], strict=True)
     ]
     probability = config.optimization.loop_probability
-    graph = PoseGraph(
-        probability, chains, closures, list(kept.map_T_body), kept.component.tolist(), list(kept.covariance)
-    )
-    recognition = Recognition(config.motion.seed, kept.words, kept.learnt_from)
-    for k in range(len(kept.stamp_ns)):
-        rows = np.flatnonzero(kept.vector_place == k)
-        recognition.add_described(kept.vector_pair[rows].tolist(), list(kept.vectors[rows]))
-    places = [
-        Place(session, k, stamp_ns)
-        for k, (session, stamp_ns) in enumerate(zip(kept.session.tolist(), kept.stamp_ns.tolist(), strict=True))
-    ]
-    return graph, recognition, places
+    poses, bounds = list(columns["map_T_body"]), list(columns["covariance"])
+    graph = PoseGraph(probability, chains, closures, poses, columns["component"].tolist(), bounds)
+    recognition = Recognition(config.motion.seed, columns["words"], int(columns["learnt_from"]))
+    vectors = columns["vectors"].astype(np.float32)
+    for k in range(len(graph)):
+        rows = np.flatnonzero(columns["vector_place"] == k)
+        recognition.add_described(columns["vector_pair"][rows].tolist(), list(vectors[rows]))
+    stamps = zip(columns["session"].tolist(), columns["stamp_ns"].tolist(), strict=True)
+    places = [Place(session, k, stamp_ns) for k, (session, stamp_ns) in enumerate(stamps)]
+    return SavedMap(graph, recognition, places, list(columns["body_T_camera"]))
 
 
 def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     folder.chmod(0o755)
     store.copy_to(folder)
-    columns = {_COLUMN_OF.get(name, name): value for name, value in vars(kept).items() if name != "closures"}
-    columns["vectors"] = kept.vectors.astype(np.float16)  # sufficient for their ranking
+    columns = _columns(kept)
     np.savez(folder / _PLACES, **columns)
-    (folder / _CLOSURES).write_bytes(closures_to_bytes(kept.closures))
+    (folder / _CLOSURES).write_bytes(closures_to_bytes([each.closure for each in kept.graph.closures]))
     save_rig(rig.with_cameras(lambda camera: replace(camera, mask=None)), folder / _RIG)  # refers to no other files
     header = {
         "format": FORMAT,
         "version": VERSION,
         "graphvio": __version__,
         "rig": rig.name,
-        "places": len(kept.stamp_ns),
-        "sessions": len(set(kept.session.tolist())),
+        "places": len(kept.graph),
+        "sessions": len(set(columns["session"].tolist())),
         "files": {name: _digest(folder / name) for name in _DIGESTED},
     }
     (folder / _HEADER).write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")

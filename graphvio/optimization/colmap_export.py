@@ -24,7 +24,7 @@ from graphvio.optimization.covisibility import verify_matches
 from graphvio.optimization.loops.closures import Place
 from graphvio.optimization.loops.colmap_library import colmap
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
-from graphvio.optimization.loops.place_images import write_image
+from graphvio.optimization.loops.place_images import write_place
 from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
 
@@ -118,19 +118,13 @@ def _by_frame(
 def _write_images(
     sessions: Sequence[SessionInput], database: FeatureDatabase, folder: Path, on_progress: Callable[[int, int], None]
 ) -> None:
-    """Write the images of all places whose files are missing."""
+    """Write the images of all places of which a file is missing."""
     places = [(session, place) for session in sessions for place in session.places]
 
     def write(of: tuple[SessionInput, Place]) -> None:
         session, place = of
-        missing = {name for name in _names(session, place, database) if not (folder / name).exists()}
-        if not missing:
-            return
-        for j, images in session.source.frameset_at(place.stamp_ns).images.items():
-            for camera, image in zip(session.rig.groups[j].cameras, images, strict=True):
-                name = image_name(session.name, camera.name, place.stamp_ns)
-                if name in missing:
-                    write_image(folder / name, image)
+        if not all((folder / name).exists() for name in _names(session, place, database)):
+            write_place(folder, session.rig, session.name, session.source.frameset_at(place.stamp_ns))
 
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="graphvio-images") as pool:
         for done, _ in enumerate(pool.map(write, places), start=1):

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -21,7 +20,7 @@ from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.backend.noise import isotropic
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.solver import Edge, Marginals
+from graphvio.optimization.solver import Edge, KnownMotions, Marginals
 
 _MAX_DIFFERENCE_M = 0.5  # of closures that agree
 _MAX_DIFFERENCE_RAD = 0.1
@@ -29,16 +28,6 @@ _MIN_VOTES = 3
 _MIN_POINTS = 100  # of a closure that votes: fewer may be of one object that two places have in common
 _FRAME_SIGMA = 1e-6
 _JOINED_SIGMAS = np.repeat([_MAX_DIFFERENCE_RAD, _MAX_DIFFERENCE_M], 3)  # of the transforms by vote
-
-
-class KnownMotions(Protocol):
-    """Motions between any two states of a fragment with their covariances, such as `Marginals`."""
-
-    def motion(self, first: int, second: int) -> tuple[Float, Float]:
-        """Return ``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
-
-    def distance(self, edge: Edge) -> float:
-        """Return the squared Mahalanobis distance, 6 degrees of freedom, of an edge that is independent of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +115,7 @@ def consistent(
     distances, candidates = np.full(len(edges), np.nan), []
     for k, edge in enumerate(edges):
         if of[edge.first] == of[edge.second]:
-            distances[k] = odometry.distance(edge)
+            distances[k] = edge.distance(odometry)
             is_candidate = distances[k] <= limit
         else:
             is_candidate = component[edge.first] == component[edge.second]
@@ -139,7 +128,7 @@ def consistent(
     if across:
         as_joined = Marginals(graph, values)
         for k in across:
-            distances[k] = as_joined.distance(edges[k])
+            distances[k] = edges[k].distance(as_joined)
     candidates = [k for k in candidates if distances[k] <= limit]
     if not candidates:
         return kept, distances

@@ -23,23 +23,14 @@ _MAX_MERGED = 6  # variables of a clique that has such
 
 @dataclass(eq=False)
 class _Clique:
-    """Variables of successive elimination, each tied to all after it and to the separator.
+    """Variables of successive elimination, each tied to all after it and to the separator."""
 
-    Attributes:
-        rows: of the variables in the system, the last one first.
-        separator: keys of the variables after them that they depend on.
-        parent: the clique that holds all of the separator, or None.
-        children: number of cliques whose parent it is and that have no covariance yet.
-        columns: of its variables and the separator in ``covariance``.
-        covariance: of both; empty before it is computed, and after the last child's is.
-    """
-
-    rows: list[int]
-    separator: list[int]
-    parent: _Clique | None
-    children: int
-    columns: dict[int, slice]
-    covariance: Float
+    rows: list[int]  # of the variables in the system, the last one first
+    separator: list[int]  # keys of the variables after them that they depend on
+    parent: _Clique | None  # the clique that holds all of the separator, or None
+    children: int  # number of cliques whose parent it is and that have no covariance yet
+    columns: dict[int, slice]  # of its variables and the separator in ``covariance``
+    covariance: Float  # of both; empty before it is computed, and after the last child's is
 
 
 def covariances(net: gtsam.GaussianBayesNet) -> Iterator[tuple[int, Float]]:

@@ -58,7 +58,7 @@ def verify_matches(
                 database.verify(first, second, None)
     listed = sorted(pairs.values(), key=lambda each: each.names)
     read = (_stored(pair, database) for pair in listed)
-    verified = read_ahead(_verified, read, depth=4)
+    verified = read_ahead(lambda stored: _verified(*stored), read, depth=4)
     for done, (pair, (rows, is_new, geometry)) in enumerate(zip(listed, verified, strict=True), start=1):
         with database.transaction():
             if is_new:
@@ -67,33 +67,23 @@ def verify_matches(
         on_progress(done, len(listed))
 
 
-@dataclass(frozen=True, eq=False)
-class _Stored:
-    """What the database holds of two images: their matches, or else the descriptors to match."""
-
-    pair: _ImagePair
-    pixels: tuple[Float, Float]
-    matches: Int | None
-    descriptors: tuple[AnyArray, AnyArray] | None
-
-
-def _stored(pair: _ImagePair, database: FeatureDatabase) -> _Stored:
-    first, second = pair.names
-    pixels = (database.pixels(first), database.pixels(second))
-    if database.has_matches(first, second):
-        return _Stored(pair, pixels, database.all_matches(first, second), None)
-    return _Stored(pair, pixels, None, (database.descriptors(first), database.descriptors(second)))
+def _stored(
+    pair: _ImagePair, database: FeatureDatabase
+) -> tuple[_ImagePair, tuple[Float, Float], Int | None, list[AnyArray]]:
+    """Return what the database holds of two images: pixels, and matches, or else None and the descriptors to match."""
+    pixels = (database.pixels(pair.names[0]), database.pixels(pair.names[1]))
+    if database.has_matches(*pair.names):
+        return pair, pixels, database.all_matches(*pair.names), []
+    return pair, pixels, None, [database.descriptors(name) for name in pair.names]
 
 
-def _verified(stored: _Stored) -> tuple[Int, bool, Any]:
+def _verified(
+    pair: _ImagePair, pixels: tuple[Float, Float], matches: Int | None, descriptors: list[AnyArray]
+) -> tuple[Int, bool, Any]:
     """Return matches (M, 2), whether they are new, and the geometry that verifies them."""
-    rows = stored.matches
-    if rows is None:
-        assert stored.descriptors is not None
-        rows = alike(*stored.descriptors)
-    pair = stored.pair
-    geometry = known_geometry(pair.cameras, pair.second_T_first, stored.pixels, rows, _EPIPOLAR_PX)
-    return rows, stored.matches is None, geometry
+    rows = alike(*descriptors) if matches is None else matches
+    geometry = known_geometry(pair.cameras, pair.second_T_first, pixels, rows, _EPIPOLAR_PX)
+    return rows, matches is None, geometry
 
 
 def _neighbours(

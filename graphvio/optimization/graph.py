@@ -135,11 +135,10 @@ class SessionGraph:
                 continue
             before, row, k = int(nodes.rows[n - 1]), int(nodes.rows[n]), first + n
             dt = float(record.stamps_ns[row] - record.stamps_ns[before]) * 1e-9
-            interval = nodes.interval(n) if params is not None else None
-            if interval is not None:
+            interval = nodes.interval(n)
+            if params is not None and interval is not None:
                 self._kind = "imu"
                 bias = gtsam.imuBias.ConstantBias(record.accel_bias[row], record.gyro_bias[row])
-                assert params is not None
                 measurements = preintegrate(interval, params, bias)
                 self.add(gtsam.CombinedImuFactor(x(k - 1), v(k - 1), x(k), v(k), b(k - 1), b(k), measurements))
             else:

@@ -63,10 +63,7 @@ class Nodes:
 def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     """Choose the framesets that motions refer to, the first and last of each epoch, and others in between.
 
-    Args:
-        record: of a session.
-        interval_s: maximum time between states, if there are framesets; more of the motions that are measured from
-            one keyframe add little.
+    These are as far apart as the interval, if there are framesets: more motions from one keyframe add little.
     """
     stamps, motions = record.stamps_ns, record.motions
     wanted = record.is_keyframe.copy()
@@ -75,7 +72,8 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     wanted[ends] = wanted[ends + 1] = True
     wanted[0] = wanted[-1] = True
     wanted[record.own.reference] = wanted[record.own.row] = True
-    wanted[_last_of_references(motions.reference, motions.row)] = True
+    last = dict(zip(motions.reference.tolist(), motions.row.tolist(), strict=True))  # rows increase
+    wanted[list(last.values())] = True
     latest = stamps[0]
     seen = np.zeros(len(stamps), dtype=bool)
     seen[motions.row] = True
@@ -89,14 +87,6 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
             latest = stamps[row]
     chosen = np.flatnonzero(wanted[motions.reference] & wanted[motions.row])
     return Nodes(record, np.flatnonzero(wanted), chosen)
-
-
-def _last_of_references(reference: Int, row: Int) -> Int:
-    """Return the last row that is measured from each reference."""
-    last: dict[int, int] = {}
-    for k, r in zip(reference.tolist(), row.tolist(), strict=True):
-        last[k] = max(last.get(k, r), r)
-    return np.array(sorted(last.values()), dtype=np.int64)
 
 
 def spread(nodes: Nodes, nav_T_body: Float) -> Float:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Float, Int
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
@@ -125,9 +124,19 @@ def optimize(
     )
     roots = sorted(set(joined.component))
     limit = chi_square_quantile(settings.loop_probability, 6)
-    closed = _solve_with_closures(whole, roots, edges, values, is_used, distances, limit, on_progress)
-    solution = poses_of(closed.values, len(whole))
-    covariances = closed.marginals.poses(len(whole))
+    while True:  # a refused closure that neither odometry nor solution contradicts is used after all
+        used = [edges[k] for k in np.flatnonzero(is_used).tolist()]
+        graph, kinds_with_loops = whole.complete(roots, used)
+        values = solve(graph, values, partial(on_progress, "with loops"))
+        marginals = Marginals(graph, values)
+        refused = np.flatnonzero(~is_used & (distances <= limit))
+        distances[refused] = [edges[k].distance(marginals) for k in refused.tolist()]
+        again = refused[distances[refused] <= limit]
+        if not len(again):
+            break
+        is_used[again] = True
+    solution = poses_of(values, len(whole))
+    covariances = marginals.poses(len(whole))
     frames = [roots.index(number) for number in joined.component]
     return Optimization(
         sessions=[
@@ -136,62 +145,24 @@ def optimize(
         ],
         loops=[
             _judged(closure, edge, bool(kept), float(distance), solution, limit)
-            for closure, edge, kept, distance in zip(closures, edges, closed.is_used, closed.distances, strict=True)
+            for closure, edge, kept, distance in zip(closures, edges, is_used, distances, strict=True)
         ],
         fragments=fragments,
         frames=frames,
         before=before,
-        after=residuals(closed.graph, closed.kinds, closed.values),
-        graph=closed.graph,
-        values=closed.values,
-        edges=closed.edges,
+        after=residuals(graph, kinds_with_loops, values),
+        graph=graph,
+        values=values,
+        edges=used,
         graph_alone=graph_alone,
         alone=alone,
         corrections=[
-            correction_of(closed.marginals, closed.values, number, int(record.own_pair.max()) + 1)
+            correction_of(marginals, values, number, int(record.own_pair.max()) + 1)
             if calibrates and len(record.own_pair)
             else None
             for number, record in enumerate(records)
         ],
     )
-
-
-class _Closed(NamedTuple):
-    is_used: Bool  # of each closure
-    distances: Float  # squared Mahalanobis distance of each refused closure from the solution
-    edges: list[Edge]  # the closures that are used
-    graph: gtsam.NonlinearFactorGraph
-    kinds: dict[str, list[int]]
-    values: gtsam.Values
-    marginals: Marginals
-
-
-def _solve_with_closures(
-    whole: SessionGraph,
-    roots: Sequence[int],
-    edges: Sequence[Edge],
-    values: gtsam.Values,
-    is_used: Bool,
-    distances: Float,
-    limit: float,
-    on_progress: Progress,
-) -> _Closed:
-    """Solve the graph with the closures that are used, until it contradicts all that are refused.
-
-    A refused closure that neither the odometry nor the solution without it contradicts is used after all.
-    """
-    is_used, distances = is_used.copy(), distances.copy()
-    while True:
-        used = [edges[k] for k in np.flatnonzero(is_used).tolist()]
-        graph, kinds = whole.complete(roots, used)
-        values = solve(graph, values, partial(on_progress, "with loops"))
-        marginals = Marginals(graph, values)
-        refused = np.flatnonzero(~is_used & (distances <= limit))
-        distances[refused] = [marginals.distance(edges[k]) for k in refused.tolist()]
-        again = refused[distances[refused] <= limit]
-        if not len(again):
-            return _Closed(is_used, distances, used, graph, kinds, values, marginals)
-        is_used[again] = True
 
 
 def _edge(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) -> Edge:

@@ -56,54 +56,31 @@ class Motions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SessionRecord:
-    """Estimates and measurements of a session's odometry, for F framesets with a pose.
+    """Estimates and measurements of a session's odometry, for F framesets with a pose."""
 
-    Attributes:
-        name: of the session.
-        stamps_ns: (F,) increasing.
-        epoch: (F,) poses of different epochs do not share a nav frame.
-        online: (F, 4, 4) ``nav_T_body`` as emitted.
-        smoothed: (F, 4, 4) ``nav_T_body`` as it left the smoother's window.
-        covariance: (F, 6, 6) of ``online``, tangent ``[rotation, translation]`` in body.
-        velocity_nav: (F, 3) m/s.
-        gyro_bias: (F, 3) rad/s; zero without an IMU.
-        accel_bias: (F, 3) m/s^2; zero without an IMU.
-        is_stationary: (F,) whether images and IMU show no motion.
-        is_keyframe: (F,) whether later motions are measured from it.
-        with_imu: (F,) whether the state has a velocity and biases.
-        is_start: (F,) whether the state was initialised or reinitialised here.
-        keyframe_before: (F,) row of the keyframe before this one, or -1 where this is none, or the motion is not known.
-        keyframe_covariance: (F, 6, 6) of the motion since that one, tangent ``[rotation, translation]`` in body; zero
-            where there is none.
-        motions: of the rig.
-        own: motions of body over whole keyframes, measured by single pairs.
-        own_pair: the pair of each of these.
-        inertial: IMU samples.
-        views: of landmarks, by a rig of single cameras only.
-        first_windows: what such a rig knew before the first pose of each epoch.
-    """
-
-    name: str
-    stamps_ns: Int
-    epoch: Int
-    online: Float
-    smoothed: Float
-    covariance: Float
-    velocity_nav: Float
-    gyro_bias: Float
-    accel_bias: Float
-    is_stationary: Bool
-    is_keyframe: Bool
-    with_imu: Bool
-    is_start: Bool
+    name: str  # of the session
+    stamps_ns: Int  # (F,) increasing
+    epoch: Int  # (F,) poses of different epochs do not share a nav frame
+    online: Float  # (F, 4, 4) ``nav_T_body`` as emitted
+    smoothed: Float  # (F, 4, 4) ``nav_T_body`` as it left the smoother's window
+    covariance: Float  # (F, 6, 6) of ``online``, tangent ``[rotation, translation]`` in body
+    velocity_nav: Float  # (F, 3) m/s
+    gyro_bias: Float  # (F, 3) rad/s; zero without an IMU
+    accel_bias: Float  # (F, 3) m/s^2; zero without an IMU
+    is_stationary: Bool  # (F,) whether images and IMU show no motion
+    is_keyframe: Bool  # (F,) whether later motions are measured from it
+    with_imu: Bool  # (F,) whether the state has a velocity and biases
+    is_start: Bool  # (F,) whether the state was initialised or reinitialised here
+    # (F,) row of the keyframe before this one, or -1 where this is none, or the motion is not known
     keyframe_before: Int
+    # (F, 6, 6) of the motion since that one, tangent ``[rotation, translation]`` in body; zero where there is none
     keyframe_covariance: Float
-    motions: Motions
-    own: Motions
-    own_pair: Int
-    inertial: Inertial
-    views: Views
-    first_windows: FirstWindows
+    motions: Motions  # of the rig
+    own: Motions  # motions of body over whole keyframes, measured by single pairs
+    own_pair: Int  # the pair of each of these
+    inertial: Inertial  # IMU samples
+    views: Views  # of landmarks, by a rig of single cameras only
+    first_windows: FirstWindows  # what such a rig knew before the first pose of each epoch
 
     def to_bytes(self) -> bytes:
         """Return the record as a numpy archive; equal records give equal bytes."""

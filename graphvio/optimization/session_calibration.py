@@ -17,15 +17,9 @@ FINDINGS = "calibration.json"
 
 
 def calibrated_rig(source: Source, config: Config, on_progress: Progress) -> tuple[Rig, list[str]]:
-    """Calibrate the rig of a recording; it stays where the recording says nothing against it, or does not show it.
+    """Calibrate the rig of a recording, and return it with sentences on what was found.
 
-    Args:
-        source: the recording.
-        config: of all stages.
-        on_progress: follows the work.
-
-    Returns:
-        The rig, and sentences on what was found.
+    It stays where the recording says nothing against it, or does not show it.
     """
     try:
         found = calibrate_recording(source, source.rig, "all", config, on_progress, compares_halves=False)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -32,6 +33,13 @@ def gtsam_errors(message: str) -> Iterator[None]:
         raise OptimizationError(f"{message} ({' '.join(str(error).split())[:200]})") from None
 
 
+class KnownMotions(Protocol):
+    """Motions between any two states with their covariances, such as `Marginals`."""
+
+    def motion(self, first: int, second: int) -> tuple[Float, Float]:
+        """Return ``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
+
+
 @dataclass(frozen=True, eq=False)
 class Edge:
     """A relative pose between two states, from a loop closure or a chain of other measurements."""
@@ -47,8 +55,9 @@ class Edge:
             x(self.first), x(self.second), gtsam.Pose3(self.first_T_second), gaussian(self.covariance)
         )
 
-    def distance(self, first_T_second: Float, covariance: Float) -> float:
-        """Return the squared Mahalanobis distance from an independent motion (4, 4), covariance (6, 6) at its end."""
+    def distance(self, known: KnownMotions) -> float:
+        """Return the squared Mahalanobis distance, 6 degrees of freedom, from motions that are independent of it."""
+        first_T_second, covariance = known.motion(self.first, self.second)
         error = se3_log(se3_inverse(first_T_second) @ self.first_T_second)
         return float(error @ np.linalg.solve(covariance + self.covariance, error))
 
@@ -128,10 +137,6 @@ class Marginals:
                     found[numbers[key]] = covariance
         return found
 
-    def pose(self, k: int) -> Float:
-        """Return the covariance (6, 6) of state k's pose, tangent ``[rotation, translation]`` in body."""
-        return self.variable(x(k))
-
     @cached_property
     def _tree(self) -> gtsam.GaussianBayesTree:
         with gtsam_errors(_FREE):
@@ -139,7 +144,7 @@ class Marginals:
             return linear.eliminateMultifrontal(self._ordering, gtsam.EliminateQR)
 
     def variable(self, key: int) -> Float:
-        """Return the covariance of a variable."""
+        """Return the covariance of a variable, such as that of a pose (6, 6), ``[rotation, translation]`` in body."""
         return np.asarray(self._tree.marginalCovariance(key))
 
     def motion(self, first: int, second: int) -> tuple[Float, Float]:
@@ -149,7 +154,3 @@ class Marginals:
         covariance = np.block([[joint.at(i, j) for j in order] for i in order])
         relative = se3_inverse(self._values.atPose3(order[0]).matrix()) @ self._values.atPose3(order[1]).matrix()
         return relative, relative_covariance(relative, covariance)
-
-    def distance(self, edge: Edge) -> float:
-        """Return the squared Mahalanobis distance, 6 degrees of freedom, of an edge that is not in the graph."""
-        return edge.distance(*self.motion(edge.first, edge.second))

@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from graphvio.errors import OptimizationError
 from graphvio.reporting.files import replace_file
@@ -91,18 +92,17 @@ class Workspace:
         except OSError as error:
             raise _cannot_write(path, error) from None
 
-    def _continue(self, state: dict[str, object]) -> None:
+    def _continue(self, state: dict[str, Any]) -> None:
         known = state["inputs"]
-        assert isinstance(known, dict)
         differing = [name for name in sorted({*known, *self._inputs}) if known.get(name) != self._inputs.get(name)]
         if differing:
             raise OptimizationError(
                 f"{self.folder}: holds results of other input (different: {', '.join(differing)}); name another folder"
             )
-        finished = state["finished"]
-        assert isinstance(finished, dict)
         self._finished = {
-            str(stage): [str(name) for name in files] for stage, files in finished.items() if self._exist(files)
+            str(stage): [str(name) for name in files]
+            for stage, files in state["finished"].items()
+            if self._exist(files)
         }
 
     def _exist(self, names: Sequence[str]) -> bool:

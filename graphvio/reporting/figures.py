@@ -21,12 +21,7 @@ def empty_figure(width_in: float, height_in: float, dpi: int = DPI) -> Figure:
 
 
 def add_axes(figure: Figure, place: tuple[float, float, float, float]) -> Any:
-    """Add axes with a grid behind the data.
-
-    Args:
-        figure: to add them to.
-        place: left, bottom, width and height as fractions of the figure.
-    """
+    """Add axes with a grid behind the data, at left, bottom, width and height as fractions of the figure."""
     axes = figure.add_axes(place)
     axes.grid(**GRID)
     axes.set_axisbelow(True)

@@ -9,10 +9,6 @@ from pathlib import Path
 def replace_file(path: Path, content: str | bytes) -> None:
     """Write a file under a temporary name, then rename it.
 
-    Args:
-        path: File to write or replace.
-        content: Text or bytes.
-
     Raises:
         OSError: if it cannot be written; an existing file is then unchanged.
     """

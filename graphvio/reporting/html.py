@@ -11,11 +11,7 @@ if TYPE_CHECKING:
 
 
 def render(template: str, **values: object) -> str:
-    """Render a template; texts are escaped.
-
-    Args:
-        template: path within the package graphvio, such as ``fleet/summary.html``.
-        values: variables of the template.
+    """Render a template, such as ``fleet/summary.html`` in the package, with values of its variables, escaped.
 
     Raises:
         jinja2.UndefinedError: if the template uses a variable that is not given.

@@ -16,8 +16,7 @@
 | ``rig-refined.yaml`` | the rig with the calibration as it was known at the end |
 """
 
-from graphvio.results.finished_run import FinishedRun
-from graphvio.results.summary import PairMedians, Percentiles, Summary
+from graphvio.results.summary import FinishedRun, PairMedians, Percentiles, Summary
 from graphvio.results.writer import ResultWriter
 
 __all__ = ["FinishedRun", "PairMedians", "Percentiles", "ResultWriter", "Summary"]

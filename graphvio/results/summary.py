@@ -1,4 +1,4 @@
-"""The figures of a run in ``summary.json``."""
+"""What a run hands over to its results at its end, and its figures in ``summary.json``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from graphvio.arrays import Int
+from graphvio.arrays import Float, Int
+from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory, travelled
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FinishedRun:
+    """What is known of a run at its end only, beside what its `ResultWriter` got frameset by frameset."""
+
+    wall_s: float  # processing time of the whole run
+    frameset_ms: Sequence[float]  # time per frameset, without decoding
+    smoothed: Sequence[tuple[int, Float]]  # stamps and poses ``nav_T_body`` (4, 4), as they left the smoother's window
+    input_faults: Mapping[str, int]  # kind -> count
+    framesets: int  # number of framesets read
+    awaited: int  # number of framesets that could have had a pose: those since the IMU's first sample
+    resets: int  # number of times that the estimator was reinitialised
+    warnings: Sequence[str] = ()  # what to correct before the next run, a sentence each
+    calibration: Sequence[str] = ()  # sentences on what the self-calibration found
+    refined_rig: Rig | None = None  # the rig as calibrated at the end, written to ``rig-refined.yaml``
 
 
 @dataclass(frozen=True)
@@ -44,59 +61,35 @@ class PairMedians:
 
 @dataclass(frozen=True)
 class Summary:
-    """The contents of ``summary.json``.
+    """The contents of ``summary.json``."""
 
-    Attributes:
-        framesets: number of framesets of the recording, with those of which no image could be read.
-        estimated: number of estimates with a pose.
-        completion: share of the framesets since the IMU's first sample that have a pose.
-        duration_s: from the first to the last estimate, with or without a pose.
-        path_length_m: along the estimated positions, within epochs.
-        wall_s: processing time of the whole run.
-        realtime_factor: ``duration_s / wall_s``; above 1 is faster than real time.
-        stage_ms: stage -> time per frameset.
-        frameset_ms: time per frameset of all stages, without decoding images.
-        input_faults: kind -> count.
-        resets: number of times that the estimator was reinitialised.
-        events: kind -> count, of all events in ``events.jsonl``.
-        warnings: what to correct before the next run, such as a rig file that the motions contradict.
-        calibration: sentences on what the self-calibration found, and what the recording did not show.
-        status: status -> number of estimates.
-        pair_medians: name of the pair -> its medians.
-        pair_rejected: name of the pair -> test of tracking or stereo matching -> corners and tracks rejected by it.
-        epochs: of each epoch its number, first and last stamp in nanoseconds, and number of poses.
-        time_offset_s: last estimate of the offset between cameras and IMU, or None where it is not estimated.
-        time_offset_sigma_s: its standard deviation, or None.
-        graphvio_version: of the run.
-        config_sha256: of ``config.yaml``.
-        evaluation: figures against the truth, or None.
-        evaluation_error: why the truth could not be used, or None.
-    """
-
-    framesets: int
-    estimated: int
-    completion: float
-    duration_s: float
-    path_length_m: float
-    wall_s: float
-    realtime_factor: float
-    stage_ms: Mapping[str, Percentiles | None]
-    frameset_ms: Percentiles | None
-    input_faults: Mapping[str, int]
-    resets: int
-    events: Mapping[str, int]
-    warnings: Sequence[str]
-    calibration: Sequence[str]
-    status: Mapping[str, int]
-    pair_medians: Mapping[str, PairMedians]
+    framesets: int  # number of framesets of the recording, with those of which no image could be read
+    estimated: int  # number of estimates with a pose
+    completion: float  # share of the framesets since the IMU's first sample that have a pose
+    duration_s: float  # from the first to the last estimate, with or without a pose
+    path_length_m: float  # along the estimated positions, within epochs
+    wall_s: float  # processing time of the whole run
+    realtime_factor: float  # ``duration_s / wall_s``; above 1 is faster than real time
+    stage_ms: Mapping[str, Percentiles | None]  # stage -> time per frameset
+    frameset_ms: Percentiles | None  # time per frameset of all stages, without decoding images
+    input_faults: Mapping[str, int]  # kind -> count
+    resets: int  # number of times that the estimator was reinitialised
+    events: Mapping[str, int]  # kind -> count, of all events in ``events.jsonl``
+    warnings: Sequence[str]  # what to correct before the next run, such as a rig file that the motions contradict
+    calibration: Sequence[str]  # sentences on what the self-calibration found, and what the recording did not show
+    status: Mapping[str, int]  # status -> number of estimates
+    pair_medians: Mapping[str, PairMedians]  # name of the pair -> its medians
+    # name of the pair -> test of tracking or stereo matching -> corners and tracks rejected by it
     pair_rejected: Mapping[str, Mapping[str, int]]
+    # of each epoch its number, first and last stamp in nanoseconds, and number of poses
     epochs: Sequence[Mapping[str, int]]
+    # last estimate of the offset between cameras and IMU, or None where it is not estimated
     time_offset_s: float | None
-    time_offset_sigma_s: float | None
-    graphvio_version: str
-    config_sha256: str
-    evaluation: Mapping[str, Any] | None = None
-    evaluation_error: str | None = None
+    time_offset_sigma_s: float | None  # its standard deviation, or None
+    graphvio_version: str  # of the run
+    config_sha256: str  # of ``config.yaml``
+    evaluation: Mapping[str, Any] | None = None  # figures against the truth, or None
+    evaluation_error: str | None = None  # why the truth could not be used, or None
 
 
 def _median(values: Sequence[float]) -> float | None:

@@ -29,9 +29,8 @@ from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
 from graphvio.reporting.files import replace_file
 from graphvio.results.calibration_plot import CalibrationHistory
-from graphvio.results.finished_run import FinishedRun
 from graphvio.results.plotting import plot_run
-from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
+from graphvio.results.summary import FinishedRun, PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
 from graphvio.self_calibration.estimate import CalibrationEstimate

@@ -14,6 +14,7 @@ from graphvio.ros2.frames import Frames
 from graphvio.ros2.messages import CORRECTION, MAP
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import stamp_of
+from graphvio.slam.checks import check_covariance, check_pose
 from graphvio.slam.interface import Served
 from graphvio.slam.keyframe import Keyframe
 
@@ -64,12 +65,11 @@ class Corrections:
         if not abs(norm - 1.0) < _MAX_NORM_ERROR:
             raise _RefusedError(f"a correction whose orientation has norm {norm:.3g}; give a unit quaternion")
         map_T_body, covariance = self._frames.correction_of(message)
-        if not np.isfinite(map_T_body).all() or not _is_positive(covariance):
-            raise _RefusedError(
-                "a correction whose position is not finite, or whose covariance is not positive definite"
-            )
+        covariance = 0.5 * (covariance + covariance.T)
+        check_pose(map_T_body, "a correction's pose")
+        check_covariance(covariance, "a correction's covariance")
         keyframe_id = self._keyframe_at(stamp_of(message.header))
-        result = self._served.correct(keyframe_id, map_T_body, 0.5 * (covariance + covariance.T))
+        result = self._served.correct(keyframe_id, map_T_body, covariance)
         if not result.accepted:
             raise _RefusedError(f"the correction of keyframe {keyframe_id}: {result.reason}")
         distance = "" if result.statistic is None else f", statistic {result.statistic:.3g} of {result.threshold:.3g}"
@@ -90,9 +90,3 @@ class Corrections:
 
 class _RefusedError(GraphvioError):
     """A correction that is refused, by these checks or by the odometry."""
-
-
-def _is_positive(covariance: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:
-    if not np.isfinite(covariance).all():
-        return False
-    return bool(np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() > 0.0)

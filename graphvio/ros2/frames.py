@@ -23,17 +23,11 @@ _CAM_R_BASE: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.
 
 @dataclass(frozen=True)
 class Frames:
-    """Names of the frames, and where the rig's body is.
+    """Names of the frames, and where the rig's body is."""
 
-    Attributes:
-        base_T_body: (4, 4) pose of body, which is the IMU's frame, in ``base``.
-        base: name of the robot's frame: x forward, y left, z up.
-        imu: name of the IMU's frame.
-    """
-
-    base_T_body: Float
-    base: str = BODY
-    imu: str = IMU_LINK
+    base_T_body: Float  # (4, 4) pose of body, which is the IMU's frame, in ``base``
+    base: str = BODY  # name of the robot's frame: x forward, y left, z up
+    imu: str = IMU_LINK  # name of the IMU's frame
 
     @staticmethod
     def of_rig(rig: Rig, base: str = BODY, imu: str = IMU_LINK) -> Frames:

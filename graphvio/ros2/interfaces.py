@@ -67,13 +67,9 @@ def encode(message: Any) -> bytes:
 
 
 def entities(participant: bytes, name: str, readers: Sequence[bytes], writers: Sequence[bytes]) -> Any:
-    """Make the message that a participant has one node with these readers and writers.
+    """Make the message that a participant has one node, such as ``/robot/graphvio``, with these readers and writers.
 
-    Args:
-        participant: its identifier, 16 bytes.
-        name: of the node, such as ``/robot/graphvio``.
-        readers: identifiers of its readers.
-        writers: identifiers of its writers.
+    All but the node are given by their identifiers of 16 bytes.
     """
     namespace, _, base = name.rpartition("/")
     node = make(

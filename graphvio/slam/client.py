@@ -26,23 +26,14 @@ S = TypeVar("S", Estimate, Prediction)
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """State of the odometry that a server serves.
+    """State of the odometry that a server serves."""
 
-    Attributes:
-        version: Version of graphvio on the server.
-        run_id: Unique name of the odometry's run.
-        epoch: Epoch of the newest keyframe, or None before the first.
-        oldest_keyframe_id: Id of the oldest keyframe that is still kept.
-        next_keyframe_id: Id of the newest keyframe, plus one.
-        has_ended: Whether the odometry has ended: no keyframe will follow.
-    """
-
-    version: str
-    run_id: str
-    epoch: int | None
-    oldest_keyframe_id: int
-    next_keyframe_id: int
-    has_ended: bool
+    version: str  # version of graphvio on the server
+    run_id: str  # unique name of the odometry's run
+    epoch: int | None  # epoch of the newest keyframe, or None before the first
+    oldest_keyframe_id: int  # id of the oldest keyframe that is still kept
+    next_keyframe_id: int  # id of the newest keyframe, plus one
+    has_ended: bool  # whether the odometry has ended: no keyframe will follow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +112,7 @@ class Client:
 
     def status(self) -> dict[str, convert.Value]:
         """Return the figures of the odometry's run by name."""
-        return convert.status_of(self._call("GetStatus", messages.GetStatusRequest()))
+        return convert.status_of(self._connection.call("GetStatus", messages.GetStatusRequest()))
 
     def keyframes(
         self, from_id: int = 0, *, with_images: bool = False, with_descriptors: bool = True
@@ -145,7 +136,7 @@ class Client:
                 from_id=next_id, with_images=with_images, with_descriptors=with_descriptors, run_id=self._run_id
             )
 
-        for update in self._connection.follow(self._connection.stub.StreamKeyframes, request):
+        for update in self._connection.follow("StreamKeyframes", request):
             keyframe = convert.keyframe_of(update.keyframe)
             next_id = keyframe.id + 1
             yield keyframe
@@ -169,7 +160,7 @@ class Client:
     def events(self) -> Iterator[Event]:
         """Yield the odometry's events from now on until it has ended."""
         request = messages.StreamEventsRequest(run_id=self._run_id)
-        for update in self._connection.follow(self._connection.stub.StreamEvents, lambda: request):
+        for update in self._connection.follow("StreamEvents", lambda: request):
             yield Event(update.stamp_ns, update.kind, update.detail)
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
@@ -194,7 +185,7 @@ class Client:
             covariance=packed(np.asarray(covariance)),
             run_id=self._run_id,
         )
-        return convert.result_of(self._call("Correct", request))
+        return convert.result_of(self._connection.call("Correct", request))
 
     def close(self) -> None:
         """End all iterators and close the connection; thread-safe, and idempotent."""
@@ -202,7 +193,7 @@ class Client:
 
     def _updates(self, rate: int) -> Iterator[Update[Any]]:
         request = messages.StreamEstimatesRequest(rate=rate, run_id=self._run_id)
-        for update in self._connection.follow(self._connection.stub.StreamEstimates, lambda: request):
+        for update in self._connection.follow("StreamEstimates", lambda: request):
             if rate == messages.RATE_FRAME:
                 state: Any = convert.estimate_of(update.estimate)
             else:
@@ -210,7 +201,4 @@ class Client:
             yield Update(state, maybe_floats(update.map_T_odom, (4, 4), "map_T_odom"), update.missed)
 
     def _info(self) -> Any:
-        return self._call("GetInfo", messages.GetInfoRequest())
-
-    def _call(self, name: str, request: Any) -> Any:
-        return self._connection.call(getattr(self._connection.stub, name), request)
+        return self._connection.call("GetInfo", messages.GetInfoRequest())

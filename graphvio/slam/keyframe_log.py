@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
@@ -15,7 +14,11 @@ _MAX_BYTES = 256 * 2**20
 
 
 class KeyframeLog:
-    """Keyframes in the order of their ids; the oldest are dropped beyond a limit of memory. Thread-safe."""
+    """Keyframes in the order of their ids; the oldest are dropped beyond a limit of memory. Thread-safe.
+
+    Attributes:
+        is_closed: whether no keyframe will follow.
+    """
 
     def __init__(self, max_bytes: int = _MAX_BYTES) -> None:
         self._max_bytes = max_bytes
@@ -23,7 +26,7 @@ class KeyframeLog:
         self._kept: deque[Keyframe] = deque()
         self._bytes = 0
         self._next_id = 0
-        self._is_closed = False
+        self.is_closed = False
 
     @property
     def oldest_id(self) -> int:
@@ -49,13 +52,8 @@ class KeyframeLog:
 
     def read(self, from_id: int, timeout_s: float | None = None) -> Keyframe | None:
         """Wait for the first keyframe that is kept, from an id on; None after the timeout, or where none will come."""
-        until = None if timeout_s is None else time.monotonic() + timeout_s
         with self._changed:
-            while self._next_id <= from_id and not self._is_closed:
-                left = None if until is None else until - time.monotonic()
-                if left is not None and left <= 0.0:
-                    return None
-                self._changed.wait(left)
+            self._changed.wait_for(lambda: self._next_id > from_id or self.is_closed, timeout_s)
             if self._next_id <= from_id or not self._kept:
                 return None
             return self._kept[bisect_left(self._kept, from_id, key=lambda kept: kept.id)]
@@ -69,13 +67,8 @@ class KeyframeLog:
     def close(self) -> None:
         """End the log; keyframes that are kept can still be read."""
         with self._changed:
-            self._is_closed = True
+            self.is_closed = True
             self._changed.notify_all()
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether no keyframe will follow."""
-        return self._is_closed
 
 
 def _size(keyframe: Keyframe) -> int:

@@ -18,12 +18,12 @@ from graphvio.arrays import Float
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.errors import MeasurementError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.slam.checks import check_covariance, check_pose
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 
 _MAX_KEYFRAMES = 10_000  # that can be corrected; about an hour
 _MAX_CORRECTIONS = 200  # that are fused again when one comes late
 _FIRST_AGREEMENT = 3  # refused corrections in a row that must agree to be accepted; doubled each time
-_RIGID = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,7 @@ class _Correction:
 class MapFrame:
     """Estimator of ``map_T_odom`` in the newest epoch; thread-safe.
 
-    Args:
-        probability: Share of the chi-square distribution beyond which corrections are refused.
+    Corrections beyond a share of the chi-square distribution, the probability, are refused.
     """
 
     def __init__(self, probability: float) -> None:
@@ -126,7 +125,8 @@ class MapFrame:
             # A repeated correction of a keyframe is no independent one.
             self._refused = [*(each for each in self._refused if each.keyframe_id != keyframe_id), candidate]
             newest = self._refused[-self._agreement :]
-            if len(newest) == self._agreement and self._agree(newest):
+            is_enough = len(newest) == self._agreement
+            if is_enough and all(_distance(each, candidate) <= self._threshold for each in newest[:-1]):
                 self._agreement *= 2
                 self._accepted, self._estimate = newest[:-1], None
                 return self._accept(
@@ -163,10 +163,6 @@ class MapFrame:
         before = [each for each in self._accepted if each.keyframe_id <= candidate.keyframe_id]
         after = [each for each in self._accepted if each.keyframe_id > candidate.keyframe_id]
         return _fused([_carried(_fused(part), candidate) for part in (before, after[::-1]) if part])
-
-    def _agree(self, corrections: Sequence[_Correction]) -> bool:
-        last = corrections[-1]
-        return all(_distance(each, last) <= self._threshold for each in corrections[:-1])
 
 
 def _fused(corrections: Sequence[_Correction]) -> _Correction:
@@ -225,18 +221,6 @@ def _checked(map_T_body: Float, covariance: Float) -> tuple[Float, Float]:
         pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
     except (TypeError, ValueError):
         raise MeasurementError("map_T_body or covariance is not an array of numbers; give (4, 4) and (6, 6)") from None
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise MeasurementError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
-    rotation = pose[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - [0, 0, 0, 1]).max())
-    if off > _RIGID or np.linalg.det(rotation) < 0.0:
-        raise MeasurementError(
-            f"map_T_body is not a rigid transform: off by {off:.2g}; give rotation and translation (4, 4)"
-        )
-    if spread.shape != (6, 6) or not np.isfinite(spread).all():
-        raise MeasurementError(
-            f"covariance has shape {spread.shape}, or holds NaN; give (6, 6) [rotation, translation]"
-        )
-    if not np.allclose(spread, spread.T, rtol=1e-6, atol=1e-12) or np.linalg.eigvalsh(spread)[0] <= 0.0:
-        raise MeasurementError("covariance is not symmetric and positive definite; give a variance for each direction")
+    check_pose(pose, "map_T_body")
+    check_covariance(spread, "covariance")
     return pose, 0.5 * (spread + spread.T)

@@ -19,7 +19,7 @@ The timeline ``time`` is relative to the first stamp.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,7 @@ from graphvio.self_calibration.curves import Curve, curves_of, values_of
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.trajectory import Trajectory
 from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, as_entity, blueprint
-from graphvio.viewer.web import WebHost, WebOptions
-from graphvio.viewer.window import URL, open_window
+from graphvio.viewer.processes import WINDOW_URL, WebHost, WebOptions, open_window
 
 _MAX_SEGMENT_POSES = 100
 _SIGMAS = 3.0
@@ -75,7 +74,7 @@ class Recording:
             sinks.append(rr.FileSink(str(save)))
         if spawn:
             open_window()
-            sinks.append(rr.GrpcSink(URL))
+            sinks.append(rr.GrpcSink(WINDOW_URL))
         self._web = None if web is None else WebHost(web)
         if web is not None:
             sinks.append(rr.GrpcSink(web.data_url))
@@ -199,19 +198,21 @@ class Recording:
         estimates, self._unsent = self._unsent, []
         for source in RATE_COLOURS:
             for k, axis in enumerate(AXES):
-                self._send_scalars(f"rates/{axis}/{source}", estimates, _rate_of(source, k))
-        self._send_scalars("biases/gyro", estimates, lambda e: e.gyro_bias)
-        self._send_scalars("biases/accel", estimates, lambda e: e.accel_bias)
+                rates = [e.rates[source][k] if source in e.rates else None for e in estimates]
+                self._send_scalars(f"rates/{axis}/{source}", estimates, rates)
+        self._send_scalars("biases/gyro", estimates, [e.gyro_bias for e in estimates])
+        self._send_scalars("biases/accel", estimates, [e.accel_bias for e in estimates])
         for stage in sorted({stage for e in estimates for stage in e.stage_ms}):
-            self._send_scalars(f"timing/{stage}", estimates, _stage_of(stage))
+            self._send_scalars(f"timing/{stage}", estimates, [e.stage_ms.get(stage) for e in estimates])
         for index in sorted({index for e in estimates for index in e.pairs}):
             name = self._rig.groups[index].name
             for entity, figure in _PAIR_CURVES.items():
-                self._send_scalars(entity.format(name), estimates, _reported(index, figure))
+                reported = [getattr(e.pairs[index], figure) if index in e.pairs else None for e in estimates]
+                self._send_scalars(entity.format(name), estimates, reported)
 
-    def _send_scalars(self, entity: str, estimates: Sequence[Estimate], value: Callable[[Estimate], Any]) -> None:
-        """Log the values, numbers or vectors (3,), of the estimates that have one."""
-        known = [(e, v) for e in estimates if (v := value(e)) is not None]
+    def _send_scalars(self, entity: str, estimates: Sequence[Estimate], all_values: Sequence[Any]) -> None:
+        """Log the values of estimates, numbers or vectors (3,), that are not None."""
+        known = [(e, v) for e, v in zip(estimates, all_values, strict=True) if v is not None]
         if not known:
             return
         values = np.array([v for _, v in known], dtype=np.float64)
@@ -274,15 +275,3 @@ def _entity_of(curve: Curve) -> str:
 def _quat_xyzw(rotation: Float) -> Float:
     w, x, y, z = quat_wxyz_from_rotation(np.ascontiguousarray(rotation))
     return np.array([x, y, z, w])
-
-
-def _rate_of(source: str, axis: int) -> Callable[[Estimate], Any]:
-    return lambda e: e.rates[source][axis] if source in e.rates else None
-
-
-def _stage_of(stage: str) -> Callable[[Estimate], Any]:
-    return lambda e: e.stage_ms.get(stage)
-
-
-def _reported(index: int, figure: str) -> Callable[[Estimate], Any]:
-    return lambda e: getattr(e.pairs[index], figure) if index in e.pairs else None

@@ -22,12 +22,9 @@ _UPPER = np.triu_indices(6)
 
 
 def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> None:
-    """Show poses, covariances, biases, events and the smoothed trajectory of a result folder.
+    """Show poses, covariances, biases, events and the smoothed trajectory of a result folder, in a window or a file.
 
-    Args:
-        folder: of `graphvio.results.ResultWriter`; files other than the trajectory may be missing.
-        spawn: open a window.
-        save: file to save a recording to, or None.
+    Files other than the trajectory may be missing.
 
     Raises:
         GraphvioError: if the folder holds no results, a file is damaged, or the viewer cannot be opened.

@@ -19,7 +19,7 @@ from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
-from graphvio.viewer.web import WebOptions
+from graphvio.viewer.processes import WebOptions
 
 if TYPE_CHECKING:
     from graphvio.self_calibration.estimate import CalibrationEstimate

@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.calibration.imu_alignment import ImuAlignment
 from graphvio.calibration.pair_calibration import PairCalibration
-from graphvio.calibration.result import Calibration, Clock
+from graphvio.calibration.result import Calibration, Clock, RigComparison
 from graphvio.errors import CalibrationError
 
 VERSION = 1
@@ -42,7 +42,8 @@ def document(found: Calibration) -> dict[str, Any]:
         "warnings": list(found.warnings),
     }
     if found.rig is not None:
-        made["rig_before"] = [_rig_before(found, j) for j in range(1, len(found.names))]
+        compared = {name: found.compare_rig(j) for j, name in enumerate(found.names) if j}
+        made["rig_before"] = [_rig_before(name, each) for name, each in compared.items() if each is not None]
     if found.imu:
         made["imu"] = [_imu(found.names[j], each) for j, each in found.imu.items()]
     if found.clocks:
@@ -132,11 +133,9 @@ def _known(found: Calibration, j: int) -> dict[str, Any]:
     }
 
 
-def _rig_before(found: Calibration, j: int) -> dict[str, Any]:
-    rig = found.compare_rig(j)
-    assert rig is not None
+def _rig_before(name: str, rig: RigComparison) -> dict[str, Any]:
     return {
-        "name": found.names[j],
+        "name": name,
         "rotation_deg": rig.angle_deg,
         "translation_m": rig.distance_m,
         "sigmas": rig.sigmas,

@@ -50,12 +50,7 @@ def doubts_of(found: RecordedCalibration) -> list[str]:
 
 
 def write_rig_report(found: RecordedCalibration, folder: Path, source: str) -> Path:
-    """Write ``report.html`` with the picture embedded, the picture, and the calibrated rig.
-
-    Args:
-        found: the calibration.
-        folder: where to write; made if missing.
-        source: name of what was calibrated, for the title.
+    """Write ``report.html`` with the picture embedded, the picture, and the rig; ``source`` is named in the title.
 
     Raises:
         CalibrationError: if the folder cannot be written.

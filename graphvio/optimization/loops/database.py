@@ -69,7 +69,7 @@ class FeatureDatabase:
 
     def __init__(self, path: Path) -> None:
         self._colmap = colmap()
-        self._path = path
+        self.path = path
         try:
             self._file = self._colmap.Database.open(path)
         except (RuntimeError, ValueError) as error:
@@ -90,11 +90,6 @@ class FeatureDatabase:
     def names(self) -> frozenset[str]:
         """Names of all images."""
         return frozenset(self._ids)
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
 
     def frame_id(self, name: str) -> int:
         """Return COLMAP's number of an image's frame."""

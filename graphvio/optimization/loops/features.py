@@ -17,7 +17,7 @@ from graphvio.config import Config
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.places import ImageObserver, PairObserver
-from graphvio.optimization.loops.sift import Extractor, SiftExtractor, SiftProcess
+from graphvio.optimization.loops.sift import SiftExtractor, SiftProcess
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import Source
 from graphvio.sources.read_ahead import read_ahead
@@ -41,19 +41,15 @@ class PairFeatures:
 class PlaceObserver:
     """Extracts the features of a place's images and matches them in stereo, in any thread; a context manager.
 
-    Args:
-        rig: of the images.
-        config: of the features.
-        in_processes: whether each thread that asks for features has a process that extracts them, for work in
-            parallel; see `graphvio.optimization.loops.sift`.
+    With ``in_processes``, each thread that asks for features has a process that extracts them: see `SiftProcess`.
     """
 
     def __init__(self, rig: Rig, config: Config, *, in_processes: bool = False) -> None:
         self._rig = rig
         self._config = config
         self._of_thread = threading.local()
-        self._make: Callable[[int], Extractor] = SiftProcess if in_processes else SiftExtractor
-        self._made: list[Extractor] = []  # appending is atomic
+        self._make = SiftProcess if in_processes else SiftExtractor
+        self._made: list[SiftExtractor | SiftProcess] = []  # appending is atomic
 
     def __enter__(self) -> Self:
         return self

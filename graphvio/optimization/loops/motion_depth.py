@@ -32,42 +32,28 @@ _THEN, _NOW = 0, 1  # instants of a neighbour and of the place
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """The features of one image.
+    """The features of one image."""
 
-    Attributes:
-        pixels: (K, 2).
-        descriptors: (K, 128) uint8.
-    """
-
-    pixels: Float
-    descriptors: AnyArray
+    pixels: Float  # (K, 2)
+    descriptors: AnyArray  # (K, 128) uint8
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceMotion:
-    """Motion of body from one place to a neighbour.
+    """Motion of body from one place to a neighbour."""
 
-    Attributes:
-        place_T_neighbour: (4, 4).
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the neighbour.
-    """
-
-    place_T_neighbour: Float
-    covariance: Float
+    place_T_neighbour: Float  # (4, 4)
+    covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the neighbour
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Features of one camera at a place, and what is not known of all their depths together.
+    """Features of one camera at a place, and what is not known of all their depths together."""
 
-    Attributes:
-        frame: the features as tracks, with covariances of what the pixels do not show; ``has_depth`` are those whose
-            inverse depth exceeds three standard deviations.
-        shifts: (S, K) of their inverse depths, 1/m, for one standard deviation of each of S errors.
-    """
-
+    # the features as tracks, with covariances of what the pixels do not show; ``has_depth`` are those whose inverse
+    # depth exceeds three standard deviations
     frame: TrackedFrame
-    shifts: Float
+    shifts: Float  # (S, K) of their inverse depths, 1/m, for one standard deviation of each of S errors
 
 
 def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> TrackedFrame:
@@ -85,18 +71,9 @@ def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> TrackedFrame:
 def located(
     camera: Camera, stamp_ns: int, features: Features, neighbours: Sequence[tuple[Features | None, PlaceMotion]]
 ) -> Located:
-    """Triangulate a single camera's features at a place with those of neighbouring places.
+    """Triangulate a single camera's features at a place with its features at neighbouring places, if it has any there.
 
-    Of several neighbours that see a feature, the one that knows its depth best counts.
-
-    Args:
-        camera: that sees them.
-        stamp_ns: of the place.
-        features: at the place.
-        neighbours: features of the same camera at other places, or none, and the motions to these.
-
-    Returns:
-        The features, and six shifts for each of the neighbours.
+    Of several neighbours that see a feature, the one that knows its depth best counts. Each has six shifts.
     """
     frame = undetermined(camera, stamp_ns, features.pixels)
     points, covariances, has_depth = frame.points.copy(), frame.covariances.copy(), frame.has_depth.copy()
@@ -104,7 +81,8 @@ def located(
     variances = np.full(len(features.pixels), np.inf)
     shifts = np.zeros((len(neighbours), _DIMENSIONS, len(features.pixels)))
     for number, (other, motion) in enumerate(neighbours):
-        if other is None or np.linalg.norm(_camera_motion(camera, motion)[:3, 3]) < _MIN_BASELINE_M:
+        camera_motion = camera.cam_T_body @ motion.place_T_neighbour @ camera.body_T_cam
+        if other is None or np.linalg.norm(camera_motion[:3, 3]) < _MIN_BASELINE_M:
             continue
         then, seen = camera.unproject(other.pixels)
         rows = alike(features.descriptors, other.descriptors)
@@ -123,10 +101,6 @@ def located(
         shifts[number][:, at] = shifted[:, better]
     made = replace(frame, points=points, covariances=covariances, has_depth=has_depth)
     return Located(made, shifts.reshape(-1, len(features.pixels)))
-
-
-def _camera_motion(camera: Camera, motion: PlaceMotion) -> Float:
-    return np.asarray(camera.cam_T_body @ motion.place_T_neighbour @ camera.body_T_cam)
 
 
 def _shifts(camera: Camera, rays: Float, then: Float, motion: PlaceMotion, found: Float) -> Float:
@@ -152,14 +126,9 @@ def _triangulated(camera: Camera, rays: Float, then: Float, place_T_neighbour: F
 
 
 def place_motion(record: SessionRecord, place: int, neighbour: int) -> PlaceMotion | None:
-    """Return the motion between two keyframes of a session, or None where the chain between them is broken.
+    """Return the motion between two keyframes, given by their rows, or None where the chain between them is broken.
 
     Errors of the motions from keyframe to keyframe are assumed to be independent.
-
-    Args:
-        record: of the session.
-        place: row of the one keyframe.
-        neighbour: row of the other.
     """
     first, last = sorted((place, neighbour))
     if record.epoch[first] != record.epoch[last]:

@@ -15,20 +15,16 @@ from graphvio.rig import Rig
 _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels hardly compress noise
 
 
-def write_image(path: Path, image: Image) -> None:
-    """Write a PNG file, which is whole or absent."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.tmp")  # renamed without fsync: there are thousands
-    _, encoded = cv2.imencode(".png", image, _PNG_OPTIONS)
-    unfinished.write_bytes(encoded.tobytes())
-    unfinished.replace(path)
-
-
 def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> None:
-    """Write all images of a frameset."""
+    """Write all images of a frameset as PNG files, each of which is whole or absent."""
     for j, images in frameset.images.items():
         for camera, image in zip(rig.groups[j].cameras, images, strict=True):
-            write_image(folder / image_name(session, camera.name, frameset.stamp_ns), image)
+            path = folder / image_name(session, camera.name, frameset.stamp_ns)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = path.with_name(f".{path.name}.tmp")  # renamed without fsync: there are thousands
+            _, encoded = cv2.imencode(".png", image, _PNG_OPTIONS)
+            unfinished.write_bytes(encoded.tobytes())
+            unfinished.replace(path)
 
 
 def read_place(folder: Path, rig: Rig, session: str, stamp_ns: int) -> FrameSet:

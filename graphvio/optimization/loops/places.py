@@ -7,7 +7,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.frontend.images import UsablePixels
-from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid
+from graphvio.frontend.lucas_kanade import MIN_GRADIENT, build_pyramid
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracks import TrackedFrame, usable_at
 from graphvio.geometry import se3_inverse, so3_log
@@ -79,7 +79,7 @@ class PairObserver(ImageObserver):
             pixels: (N, 2) in the left one.
             inverse_depths: (N,) expected, 1/m; NaN or None where unknown.
         """
-        left, right = (self._pyramid(image) for image in images)
+        left, right = (build_pyramid(np.ascontiguousarray(image), _LEVELS) for image in images)
         rays, has_ray = self.pair.left.unproject(pixels)
         n = len(pixels)
         expected = np.full(n, np.nan) if inverse_depths is None else inverse_depths
@@ -98,6 +98,3 @@ class PairObserver(ImageObserver):
             has_depth=matches.good & has_ray,
             frames_without_depth=np.zeros(n, dtype=np.int64),
         )
-
-    def _pyramid(self, image: Image) -> Pyramid:
-        return build_pyramid(np.ascontiguousarray(image), _LEVELS)

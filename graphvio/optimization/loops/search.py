@@ -32,7 +32,7 @@ class SessionInput:
     source: Source  # of its images
     rig: Rig  # of the cameras
     places: Sequence[Place]  # in the order of time
-    record: SessionRecord | None = None  # of its motions, by which single cameras' features get a depth
+    record: SessionRecord  # of its motions, by which single cameras' features get a depth
 
 
 def find_loops(
@@ -147,14 +147,12 @@ class _Verifier:
     def _neighbours(self, number: int) -> list[tuple[PlaceView, PlaceMotion]]:
         """Return the places next to a place in its session, and the motions to them where they are known."""
         place = self._places[number]
-        record = self._sessions[place.session].record
         found: list[tuple[PlaceView, PlaceMotion]] = []
-        for step in NEIGHBOURS if record is not None else ():
+        for step in NEIGHBOURS:
             if not 0 <= number + step < len(self._places) or self._places[number + step].session != place.session:
                 continue
             other = self._places[number + step]
-            assert record is not None
-            motion = place_motion(record, place.row, other.row)
+            motion = place_motion(self._sessions[place.session].record, place.row, other.row)
             if motion is not None:
                 found.append((self._view(other), motion))
         return found

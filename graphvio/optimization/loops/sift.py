@@ -9,7 +9,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,22 +21,8 @@ _FIRST_OCTAVE = 0  # full resolution; COLMAP's default of twice that takes three
 _PROGRAM = "from graphvio.optimization.loops.sift import serve; serve()"
 
 
-class Extractor(Protocol):
-    """Extracts the features of images."""
-
-    def extract(self, image: Image) -> tuple[Float, AnyArray]:
-        """Return pixels (K, 2) and descriptors (K, 128), uint8, of an image's features."""
-
-    def close(self) -> None:
-        """Release what it holds."""
-
-
 class SiftExtractor:
-    """Extracts features in the calling thread.
-
-    Args:
-        features: maximum number in an image, the largest ones.
-    """
+    """Extracts at most so many features of an image, the largest ones, in the calling thread."""
 
     def __init__(self, features: int) -> None:
         library = colmap()
@@ -49,21 +35,17 @@ class SiftExtractor:
         self._extractor = library.FeatureExtractor.create(options, library.Device.cpu)
 
     def extract(self, image: Image) -> tuple[Float, AnyArray]:
-        """See `Extractor`."""
+        """Return pixels (K, 2) and descriptors (K, 128), uint8, of an image's features."""
         keypoints, descriptors = self._extractor.extract_from_uint8_array(np.ascontiguousarray(image))
         pixels = np.asarray(self._library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - CENTRE_PX
         return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
 
     def close(self) -> None:
-        """See `Extractor`."""
+        """Do nothing: a `SiftProcess` has something to close."""
 
 
 class SiftProcess:
-    """Extracts features in a process of its own, which ends with this one at the latest; for one thread at a time.
-
-    Args:
-        features: maximum number in an image, the largest ones.
-    """
+    """Does the same in a process of its own, which ends with this one at the latest; for one thread at a time."""
 
     def __init__(self, features: int) -> None:
         pipe = subprocess.PIPE
@@ -71,7 +53,7 @@ class SiftProcess:
         self._send(features)
 
     def extract(self, image: Image) -> tuple[Float, AnyArray]:
-        """See `Extractor`.
+        """See `SiftExtractor`.
 
         Raises:
             OptimizationError: if the process has ended.

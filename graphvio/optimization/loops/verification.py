@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -27,33 +27,9 @@ _MIN_MATCHES = 20
 _MAX_CROSSINGS = 2  # pairs of images of a candidate that are matched
 
 
-class PlaceView(Protocol):
-    """A place whose features may be in memory or in a database; j is an index in the rig's groups."""
-
-    @property
-    def rig(self) -> Rig:
-        """Rig that took the images."""
-
-    def sees(self, j: int) -> bool:
-        """Return whether there is such an image."""
-
-    def features(self, j: int) -> tuple[Float, AnyArray]:
-        """Return pixels (K, 2) and descriptors (K, 128), uint8, of the left image, or of a single camera's."""
-
-    def frame(self, j: int) -> TrackedFrame:
-        """Return the same features with their depth; those of a single camera have none."""
-
-    def frameset(self) -> FrameSet:
-        """Return the place's images, as far as they still exist."""
-
-
-Neighbours = Callable[[], Sequence[tuple[PlaceView, PlaceMotion]]]
-"""Returns the places of the same rig next to a place, and the motions from it to them."""
-
-
 @dataclass(frozen=True, eq=False)
 class StoredView:
-    """A place in a database, which is read under a lock."""
+    """A place in a database, which is read under a lock; j is an index in the rig's groups."""
 
     rig: Rig
     session: str
@@ -67,17 +43,17 @@ class StoredView:
         return image_name(self.session, self.rig.groups[j].left.name, self.stamp_ns)
 
     def sees(self, j: int) -> bool:
-        """See `PlaceView`."""
+        """Return whether there is such an image."""
         return self.name(j) in self.database.names
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """See `PlaceView`."""
+        """Return pixels (K, 2) and descriptors (K, 128), uint8, of the left image, or of a single camera's."""
         name = self.name(j)
         with self.lock:
             return self.database.pixels(name), self.database.descriptors(name)
 
     def frame(self, j: int) -> TrackedFrame:
-        """See `PlaceView`."""
+        """Return the same features with their depth; those of a single camera have none."""
         group, left = self.rig.groups[j], self.name(j)
         if isinstance(group, SingleCamera):
             return undetermined(group.left, self.stamp_ns, self.features(j)[0])
@@ -88,7 +64,7 @@ class StoredView:
         return frame_of(group, self.stamp_ns, pixels, in_right, rows)
 
     def frameset(self) -> FrameSet:
-        """See `PlaceView`."""
+        """Return the place's images, as far as they still exist."""
         return self.frameset_at(self.stamp_ns)
 
 
@@ -101,21 +77,26 @@ class FreshView:
     seen: Mapping[int, PairFeatures]  # by the index in the rig's groups
 
     def sees(self, j: int) -> bool:
-        """See `PlaceView`."""
+        """See `StoredView`."""
         return j in self.seen
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """See `PlaceView`."""
+        """See `StoredView`."""
         return self.seen[j].left, self.seen[j].descriptors
 
     def frame(self, j: int) -> TrackedFrame:
-        """See `PlaceView`."""
+        """See `StoredView`."""
         seen = self.seen[j]
         return frame_of(self.rig.groups[j], self.images.stamp_ns, seen.left, seen.right, seen.rows)
 
     def frameset(self) -> FrameSet:
-        """See `PlaceView`."""
+        """See `StoredView`."""
         return self.images
+
+
+PlaceView = StoredView | FreshView
+Neighbours = Callable[[], Sequence[tuple[PlaceView, PlaceMotion]]]
+"""Returns the places of the same rig next to a place, and the motions from it to them."""
 
 
 def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: AnyArray) -> list[tuple[int, int]]:

@@ -58,12 +58,7 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
 
 
 def write_plan(found: Optimization, folder: Path, points: Float | None) -> Path:
-    """Write a picture of the frame with most framesets from above, whose path is returned.
-
-    Args:
-        found: the optimisation.
-        folder: where to write, with the odometry's results.
-        points: (N, 3) of that frame's map, or None.
+    """Write a picture of the frame with most framesets from above, with points (N, 3) of its map; return its path.
 
     Raises:
         OptimizationError: if the folder cannot be written.

@@ -54,19 +54,19 @@ class Connection:
             self._channel = grpc.secure_channel(self.address, grpc.ssl_channel_credentials(self._ca), options)
         self.stub: Any = Stub(self._channel)
 
-    def call(self, method: Any, request: Any) -> Any:
-        """Return the server's answer to a request.
+    def call(self, name: str, request: Any) -> Any:
+        """Return the server's answer to a request of a call, such as ``GetInfo``.
 
         Raises:
             ServiceError: If the call fails.
         """
         self._check_open()
         try:
-            return method(request, timeout=self._timeout_s, metadata=self._metadata)
+            return getattr(self.stub, name)(request, timeout=self._timeout_s, metadata=self._metadata)
         except grpc.RpcError as error:
             raise self._error(error) from None
 
-    def follow(self, method: Any, next_request: Callable[[], Any]) -> Iterator[Any]:
+    def follow(self, name: str, next_request: Callable[[], Any]) -> Iterator[Any]:
         """Yield the messages of a stream until the server ends it; reopen it when it breaks.
 
         Raises:
@@ -77,7 +77,7 @@ class Connection:
         wait_s = _FIRST_WAIT_S
         has_begun = False
         while True:
-            call = self._open(method, next_request())
+            call = self._open(name, next_request())
             if call is None:
                 return
             try:
@@ -93,7 +93,9 @@ class Connection:
                 if is_over or not _may_pass(error, has_begun):
                     raise self._error(error) from None
             finally:
-                self._end(call)
+                call.cancel()
+                with self._lock:
+                    self._calls.discard(call)
             self._closing.wait(wait_s)
             wait_s = min(2.0 * wait_s, _MAX_WAIT_S)
 
@@ -106,18 +108,13 @@ class Connection:
             call.cancel()
         self._channel.close()
 
-    def _open(self, method: Any, request: Any) -> Any | None:
+    def _open(self, name: str, request: Any) -> Any | None:
         with self._lock:
             if self._closing.is_set():
                 return None
-            call = method(request, metadata=self._metadata)
+            call = getattr(self.stub, name)(request, metadata=self._metadata)
             self._calls.add(call)
             return call
-
-    def _end(self, call: Any) -> None:
-        call.cancel()
-        with self._lock:
-            self._calls.discard(call)
 
     def _check_open(self) -> None:
         if self._closing.is_set():

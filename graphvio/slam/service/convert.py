@@ -202,11 +202,7 @@ def _image_message(image: Image) -> Any:
 
 def _images_of(message: Any, where: str) -> tuple[AnyArray, ...]:
     sides = (message.left, message.right) if message.HasField("right") else (message.left,)
-    return tuple(_image_of(side, where) for side in sides)
-
-
-def _image_of(message: Any, where: str) -> AnyArray:
-    return byte_rows(message.pixels, (message.height, message.width), f"{where}: image")
+    return tuple(byte_rows(side.pixels, (side.height, side.width), f"{where}: image") for side in sides)
 
 
 def result_message(result: CorrectionResult) -> Any:

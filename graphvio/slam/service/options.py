@@ -16,26 +16,18 @@ RUN_KEY = "graphvio-run"  # key of a stream's initial metadata
 class ServiceOptions:
     """Options of the service.
 
-    Attributes:
-        host: Address to listen on: 127.0.0.1, or with TLS and a token another one, such as 0.0.0.0 for all.
-        port: TCP port; 0 for any free one.
-        certificate: PEM file with the server's certificate, followed by those that signed it.
-        key: PEM file with its private key, not encrypted.
-        token_file: File with the token that clients must send, readable by its owner only.
-        max_clients: Maximal number of connections with open streams, of which each may have four.
-        keepalive_s: A client that does not answer for one and a half times as long is disconnected.
-
     Raises:
         ServiceError: If a value is invalid, or a public address lacks TLS or a token.
     """
 
+    # address to listen on: 127.0.0.1, or with TLS and a token another one, such as 0.0.0.0 for all
     host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT
-    certificate: Path | None = None
-    key: Path | None = None
-    token_file: Path | None = None
-    max_clients: int = 8
-    keepalive_s: float = 10.0
+    port: int = DEFAULT_PORT  # TCP port; 0 for any free one
+    certificate: Path | None = None  # PEM file with the server's certificate, followed by those that signed it
+    key: Path | None = None  # PEM file with its private key, not encrypted
+    token_file: Path | None = None  # file with the token that clients must send, readable by its owner only
+    max_clients: int = 8  # maximal number of connections with open streams, of which each may have four
+    keepalive_s: float = 10.0  # a client that does not answer for one and a half times as long is disconnected
 
     def __post_init__(self) -> None:
         if not 0 <= self.port < 2**16:

@@ -45,11 +45,7 @@ def check(options: ServiceOptions) -> None:
 
 
 class GrpcServer:
-    """Server of a running odometry; a context manager.
-
-    Args:
-        served: The odometry; the server only reads from it and passes corrections on.
-        options: Address and accepted clients.
+    """Server of a running odometry, from which it only reads, and to which it passes corrections; a context manager.
 
     Raises:
         MissingExtraError: On import of the module, if grpcio is not installed.

@@ -13,10 +13,11 @@ from typing import Any, TypeVar
 from graphvio.errors import GraphvioError, ServiceError
 from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.queues import BoundedQueue, Broadcast
+from graphvio.slam.checks import check_covariance, check_pose
 from graphvio.slam.interface import Served, map_of_epoch, newest_epoch
 from graphvio.slam.keyframe_log import KeyframeLog
 from graphvio.slam.service import convert, grpc, messages
-from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
+from graphvio.slam.service.arrays import floats, packed
 from graphvio.slam.service.options import RUN_KEY
 from graphvio.version import __version__
 
@@ -30,14 +31,10 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Stream:
-    """An open stream.
+    """An open stream."""
 
-    Attributes:
-        client: Address of its client.
-        read_s: When its client last read a message, or opened it, by `time.monotonic`.
-    """
-
-    client: str
+    client: str  # address of its client
+    # when its client last read a message, or opened it, by `time.monotonic`
     read_s: float = field(default_factory=time.monotonic)
 
 
@@ -150,9 +147,11 @@ class Servicer:
         try:
             if request.keyframe_id < 0:
                 raise ServiceError(f"keyframe_id is {request.keyframe_id}; the first keyframe is 0")
-            map_T_body = checked_pose(floats(request.map_T_body, (4, 4), "map_T_body"), "map_T_body")
-            covariance = checked_covariance(floats(request.covariance, (6, 6), "covariance"), "covariance")
-        except ServiceError as error:
+            map_T_body = floats(request.map_T_body, (4, 4), "map_T_body")
+            covariance = floats(request.covariance, (6, 6), "covariance")
+            check_pose(map_T_body, "map_T_body")
+            check_covariance(covariance, "covariance")
+        except GraphvioError as error:
             context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
         return _answer(
             context,

@@ -1,4 +1,4 @@
-"""Serves browsers: rerun's web viewer and data server as a separate process.
+"""Rerun's programs as processes of their own: its window, which stays when this one ends, and the server of browsers.
 
 Within a program rerun (0.41) would listen on all addresses, without a password.
 """
@@ -19,7 +19,12 @@ from urllib.parse import quote
 
 from graphvio.errors import GraphvioError
 
-HOST = "127.0.0.1"
+_HOST = "127.0.0.1"
+_WINDOW_PORT = 9876
+WINDOW_URL = f"rerun+http://{_HOST}:{_WINDOW_PORT}/proxy"
+"""Address of the window's data."""
+
+_WINDOW_S, _SURE_S = 8.0, 1.0
 _START_S, _END_S = 20.0, 5.0
 # Ends the server when its standard input is closed, which also happens when this process is killed.
 _SCRIPT = 'trap : TERM; "$@" & read -r _; kill -TERM 0; wait'
@@ -52,12 +57,12 @@ class WebOptions:
     @property
     def data_url(self) -> str:
         """Address of the data."""
-        return f"rerun+http://{HOST}:{self.data_port}/proxy"
+        return f"rerun+http://{_HOST}:{self.data_port}/proxy"
 
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
+        return f"http://{_HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
 
 
 class WebHost:
@@ -71,7 +76,7 @@ class WebHost:
         for port in (options.port, options.data_port):
             _check_free(port)
         command = [
-            *(*rerun_program(), "--serve-web", "--bind", HOST),
+            *(*_rerun_program(), "--serve-web", "--bind", _HOST),
             *("--port", str(options.data_port), "--web-viewer-port", str(options.port)),
             *("--server-memory-limit", f"{options.memory_mb}MB"),
         ]
@@ -103,25 +108,64 @@ class WebHost:
     def _wait_for(self, port: int) -> None:
         until = time.monotonic() + _START_S
         while time.monotonic() < until:
-            with suppress(OSError), socket.create_connection((HOST, port), timeout=1.0):
+            if _answers(port):
                 return
             time.sleep(0.05)
-        raise GraphvioError(f"web view: rerun does not serve on {HOST}:{port}; does  rerun --serve-web  work here?")
+        raise GraphvioError(f"web view: rerun does not serve on {_HOST}:{port}; does  rerun --serve-web  work here?")
 
 
-def rerun_program() -> list[str]:
+def open_window() -> None:
+    """Open a window, unless one is open, and wait until it answers.
+
+    Raises:
+        RuntimeError: if it does not, as without a usable display.
+        OSError: if rerun cannot be executed.
+    """
+    if not _answers(_WINDOW_PORT):
+        subprocess.run(
+            [*window_command(_WINDOW_PORT), "--detach-process"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the odometry
+            check=False,
+            env=os.environ | {"RERUN_APP_ONLY": "true"},
+        )
+    start = time.monotonic()
+    while (waited := time.monotonic() - start) < _WINDOW_S:
+        time.sleep(0.1)
+        if _answers(_WINDOW_PORT) and waited > _SURE_S:  # without a usable display it ends at once
+            return
+    raise RuntimeError("rerun's window does not answer; is the display usable? --save-rrd FILE needs none")
+
+
+def window_command(port: int) -> list[str]:
+    """Return the command of a window that takes data on a port of this machine only."""
+    return [
+        *(*_rerun_program(), "--bind", _HOST, "--port", str(port), "--expect-data-soon"),
+        *("--memory-limit", "75%", "--server-memory-limit", "1GiB"),
+    ]
+
+
+def _rerun_program() -> list[str]:
     """Find rerun's program, as the beginning of a command; its Python launcher would end before it."""
     package = find_spec("rerun_cli")
     program = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
     return [str(program)] if program is not None and program.is_file() else [sys.executable, "-m", "rerun_cli"]
 
 
+def _answers(port: int) -> bool:
+    with suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
+        return True
+    return False
+
+
 def _check_free(port: int) -> None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just closed is free
         try:
-            probe.bind((HOST, port))
+            probe.bind((_HOST, port))
         except OSError as error:
             raise GraphvioError(
-                f"web view: port {port} of {HOST} cannot be used ({error.strerror}); choose another one"
+                f"web view: port {port} of {_HOST} cannot be used ({error.strerror}); choose another one"
             ) from None
