@@ -58,6 +58,8 @@ class EventKind(StrEnum):
     """A camera repeats its image while others do not; its pair is left out until the image changes."""
     PAIR_UNUSED = "pair_unused"
     """A stereo pair takes part in no motion for 5 s, while other cameras do; check its images and its calibration."""
+    IMAGES_EXCHANGED = "images_exchanged"
+    """A pair's left and right images match only when they are exchanged; check cables, topics and the rig file."""
     CALIBRATION_CORRECTED = "calibration_corrected"
     """A part of the rig file is wrong beyond 5 sigma by two windows of keyframes; it is corrected from now on."""
     CALIBRATION_CHANGED = "calibration_changed"

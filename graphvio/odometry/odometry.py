@@ -37,6 +37,7 @@ from graphvio.odometry.assembly import (
     keyframe_of,
     with_state,
 )
+from graphvio.odometry.exchanged_images import ExchangedImages
 from graphvio.odometry.fixed_calibration import FixedCalibration
 from graphvio.odometry.frameset_imu import FramesetImu
 from graphvio.odometry.group_clocks import GroupClocks
@@ -129,6 +130,7 @@ class Odometry:
         self._calibration = self._new_calibration()
         self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
+        self._exchanged = ExchangedImages(rig, self.config, self.report)
         self._rates = AngularRates()
         self._on_prediction = on_prediction
         self._on_step: list[Callable[[Step], None]] = []
@@ -249,7 +251,13 @@ class Odometry:
     def rig_warnings(self) -> list[str]:
         """Where the measurements contradict the rig: a sentence each, with the size and what is done about it."""
         off = [f"{finding}; {CORRECTED}" for finding in self.calibration_findings if finding.is_significant]
-        return self._vision_events.rig_warnings + off + self._imu.warnings + self._clocks.warnings
+        return (
+            self._vision_events.rig_warnings
+            + self._exchanged.warnings
+            + off
+            + self._imu.warnings
+            + self._clocks.warnings
+        )
 
     @property
     def calibration(self) -> CalibrationEstimate | None:
@@ -372,6 +380,7 @@ class Odometry:
         visual = self._frontend.process(frameset, self._estimator.motion_since, readout, self._imu.gyro_rotation_since)
         if not predicted.is_initial:
             self._vision_events.update(frameset.stamp_ns, visual, self._frontend.extrinsic_errors)
+            self._exchanged.update(frameset, visual)
         self.stage_ms.update(visual.stage_ms)
         return visual
 
