@@ -37,7 +37,6 @@ from graphvio.odometry.assembly import (
     keyframe_of,
     with_state,
 )
-from graphvio.odometry.exchanged_images import ExchangedImages
 from graphvio.odometry.fixed_calibration import FixedCalibration
 from graphvio.odometry.frameset_imu import FramesetImu
 from graphvio.odometry.group_clocks import GroupClocks
@@ -45,6 +44,7 @@ from graphvio.odometry.imu_clock import with_late_clock
 from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.pairs_calibration import PairsCalibration
+from graphvio.odometry.rig_mistakes import RigMistakes
 from graphvio.odometry.singles_calibration import SinglesCalibration
 from graphvio.odometry.step import Step
 from graphvio.odometry.synchroniser import Synchroniser
@@ -130,7 +130,7 @@ class Odometry:
         self._calibration = self._new_calibration()
         self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
-        self._exchanged = ExchangedImages(rig, self.config, self.report)
+        self._mistakes = RigMistakes(rig, self.config, self.report)
         self._rates = AngularRates()
         self._on_prediction = on_prediction
         self._on_step: list[Callable[[Step], None]] = []
@@ -253,7 +253,7 @@ class Odometry:
         off = [f"{finding}; {CORRECTED}" for finding in self.calibration_findings if finding.is_significant]
         return (
             self._vision_events.rig_warnings
-            + self._exchanged.warnings
+            + self._mistakes.warnings
             + off
             + self._imu.warnings
             + self._clocks.warnings
@@ -380,7 +380,7 @@ class Odometry:
         visual = self._frontend.process(frameset, self._estimator.motion_since, readout, self._imu.gyro_rotation_since)
         if not predicted.is_initial:
             self._vision_events.update(frameset.stamp_ns, visual, self._frontend.extrinsic_errors)
-            self._exchanged.update(frameset, visual)
+            self._mistakes.update(frameset, visual)
         self.stage_ms.update(visual.stage_ms)
         return visual
 

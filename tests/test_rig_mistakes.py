@@ -1,7 +1,8 @@
-"""Pairs whose left and right images are exchanged are reported, and no others."""
+"""Pairs whose images are exchanged or whose transforms are inverted are reported, and no others."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,18 +10,19 @@ import pytest
 
 from graphvio import FrameSet, Odometry, open_source
 from graphvio.arrays import Image
+from graphvio.geometry import se3_inverse
 from graphvio.measurements.events import EventKind
 from graphvio.rig import Rig
 from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 
 
-def exchanged_in(rig: Rig, framesets: list[FrameSet]) -> tuple[list[str], list[str]]:
+def mistaken_in(rig: Rig, framesets: list[FrameSet]) -> tuple[list[str], list[str]]:
     """The names in events and warnings of a run without the IMU."""
     odometry = Odometry(rig.without_imu())
     for frameset in framesets:
         odometry.process(frameset)
-    events = [each for each in odometry.take_events() if each.kind == EventKind.IMAGES_EXCHANGED]
-    warnings = [each for each in odometry.rig_warnings if "exchanged" in each]
+    events = [each for each in odometry.take_events() if each.kind == EventKind.RIG_MISTAKEN]
+    warnings = [each for each in odometry.rig_warnings if "match only if" in each]
     return [each.detail.split(":")[0] for each in events], [each.split(":")[0] for each in warnings]
 
 
@@ -48,21 +50,32 @@ def of_one_pair(framesets: list[FrameSet]) -> list[FrameSet]:
 def test_exchanged_pairs_are_named_once(walked: tuple[Rig, list[FrameSet]], pairs: set[int]) -> None:
     rig, framesets = walked
     names = [rig.pairs[j].name for j in sorted(pairs)]
-    assert exchanged_in(rig, with_exchanged(framesets, pairs)) == (names, names)
+    assert mistaken_in(rig, with_exchanged(framesets, pairs)) == (names, names)
 
 
 def test_one_exchanged_pair_alone_is_named(walked: tuple[Rig, list[FrameSet]]) -> None:
     rig, framesets = walked
     one = rig.with_pairs([0])
-    assert exchanged_in(one, of_one_pair(with_exchanged(framesets, {0})))[1] == [one.pairs[0].name]
-    assert exchanged_in(one, of_one_pair(framesets)) == ([], [])
+    assert mistaken_in(one, of_one_pair(with_exchanged(framesets, {0})))[1] == [one.pairs[0].name]
+    assert mistaken_in(one, of_one_pair(framesets)) == ([], [])
 
 
 def test_warning_ends_when_images_are_right_again(walked: tuple[Rig, list[FrameSet]]) -> None:
     rig, framesets = walked
-    events, warnings = exchanged_in(rig, with_exchanged(framesets[:15], {1}) + framesets[15:])
+    events, warnings = mistaken_in(rig, with_exchanged(framesets[:15], {1}) + framesets[15:])
     assert events == [rig.pairs[1].name]
     assert warnings == []
+
+
+def test_inverted_transforms_are_named(walked: tuple[Rig, list[FrameSet]]) -> None:
+    rig, framesets = walked
+    inverted = rig.with_cameras(lambda camera: replace(camera, body_T_cam=se3_inverse(camera.body_T_cam)))
+    odometry = Odometry(inverted.with_pairs([0]).without_imu())
+    for frameset in of_one_pair(framesets):
+        odometry.process(frameset)
+    (warning,) = [each for each in odometry.rig_warnings if "match only if" in each]
+    assert "body_T_cam of both cameras is inverted" in warning
+    assert "exchanged" not in warning
 
 
 def waves(shift_px: float) -> Image:
@@ -85,14 +98,14 @@ def other_images(kind: str, images: tuple[Image, ...]) -> tuple[Image, ...]:
 
 
 @pytest.mark.parametrize("kind", ["dark", "far away", "not of one scene", "one is black", "upside down", "waves"])
-def test_images_that_do_not_match_are_not_called_exchanged(walked: tuple[Rig, list[FrameSet]], kind: str) -> None:
+def test_images_that_do_not_match_have_no_mistake(walked: tuple[Rig, list[FrameSet]], kind: str) -> None:
     rig, framesets = walked
     changed = [FrameSet(each.stamp_ns, {0: other_images(kind, each.images[0])}) for each in framesets]
-    assert exchanged_in(rig.with_pairs([0]), changed) == ([], [])
+    assert mistaken_in(rig.with_pairs([0]), changed) == ([], [])
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_wrong_calibration_is_not_called_exchanged(walked: tuple[Rig, list[FrameSet]], seed: int) -> None:
+def test_wrong_calibration_is_no_mistake(walked: tuple[Rig, list[FrameSet]], seed: int) -> None:
     rig, framesets = walked
     written = draw(rig, CalibrationErrorSizes.of_level(3), seed).written_rig
-    assert exchanged_in(written, framesets) == ([], [])
+    assert mistaken_in(written, framesets) == ([], [])

@@ -1,26 +1,35 @@
-"""Pairs whose left and right images are exchanged: they match only the other way round."""
+"""Frequent mistakes in a rig, which the images of a pair show: left and right exchanged, transforms inverted.
+
+Such a pair finds next to none of its left image in its right one, and many with the mistake undone.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from graphvio.arrays import Image
 from graphvio.config import Config
+from graphvio.errors import RigError
 from graphvio.frontend.tracker import GroupTracker
+from graphvio.geometry import se3_inverse
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import VisualResult
 from graphvio.measurements.sensors import FrameSet
-from graphvio.rig import Rig, StereoPair
+from graphvio.rig import Camera, Rig, StereoPair
 
 _CHECKED_AFTER = (10, 100)  # framesets in which few of a pair's corners have a depth
 _FEW_POINTS = 0.3  # of the corners; some always match something
 _MIN_CORNERS = 30
 _MIN_MATCHES = 30
-_MAX_SHARE = 0.2  # of the corners that are matched as they should be, of those that are when exchanged
+_MAX_SHARE = 0.2  # of the corners that match as the rig is, of those that match with a mistake undone
+_EXCHANGED = "left and right are exchanged (cables, topics, or names in the rig file)"
+_INVERTED = "body_T_cam of both cameras is inverted, so that it maps points of the camera to body"
 
 
-class ExchangedImages:
-    """Reports pairs whose left and right images are exchanged, as by cables, topics or a rig file.
+class RigMistakes:
+    """Reports pairs whose images match only if a mistake in the rig is undone.
 
     Args:
         rig: Of the rig file.
@@ -53,17 +62,32 @@ class ExchangedImages:
             if self._with_few_points[j] not in _CHECKED_AFTER or j in self._warnings:
                 continue
             left, right = (np.ascontiguousarray(image) for image in frameset.images[j])
-            if self._are_exchanged(self._pairs[j], left, right):
-                self._warnings[j] = (
-                    f"{self._pairs[j].name}: its left images match its right ones only when they are exchanged; check "
-                    "which camera is left and which right (cables, topics, rig file)"
-                )
-                self._report(frameset.stamp_ns, EventKind.IMAGES_EXCHANGED, self._warnings[j])
+            mistakes = self._mistakes(self._pairs[j], left, right)
+            if mistakes:
+                self._warnings[j] = f"{self._pairs[j].name}: its images match only if {' or '.join(mistakes)}"
+                self._report(frameset.stamp_ns, EventKind.RIG_MISTAKEN, self._warnings[j])
 
-    def _are_exchanged(self, pair: StereoPair, left: Image, right: Image) -> bool:
-        exchanged = self._matches(pair, right, left)
-        return exchanged >= _MIN_MATCHES and self._matches(pair, left, right) < _MAX_SHARE * exchanged
+    def _mistakes(self, pair: StereoPair, left: Image, right: Image) -> list[str]:
+        """Return the mistakes without which the images match. They may be the same, where body has a camera's axes."""
+        n_as_it_is = self._matches(pair, left, right)
+        n_undone = {_EXCHANGED: self._matches(pair, right, left)}
+        inverted = _inverted(pair)
+        if inverted is not None:
+            n_undone[_INVERTED] = self._matches(inverted, left, right)
+        return [mistake for mistake, n in n_undone.items() if n >= _MIN_MATCHES and n_as_it_is < _MAX_SHARE * n]
 
     def _matches(self, pair: StereoPair, left: Image, right: Image) -> int:
         """Count the corners of a left image that have a depth by the right one."""
         return int(GroupTracker(pair, self._config).observe(0, left, right, None, None).has_depth.sum())
+
+
+def _inverted(pair: StereoPair) -> StereoPair | None:
+    """Return the pair with its cameras' transforms inverted, or None if that is no pair."""
+
+    def invert(camera: Camera) -> Camera:
+        return replace(camera, body_T_cam=se3_inverse(camera.body_T_cam))
+
+    try:
+        return StereoPair(pair.name, invert(pair.left), invert(pair.right))
+    except RigError:
+        return None
