@@ -23,7 +23,7 @@ from graphvio.self_calibration import online, solver
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
 from graphvio.self_calibration.collector import FullWindow, WindowCollector
-from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.evidence import _FACTORS, EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector
@@ -208,6 +208,26 @@ def test_file_factors_of_what_two_groups_explain_are_those_of_the_likelier_one(w
     factors, _ = Evidence(information, vector).file_factors(prior, np.full(2, 10.0))
     assert factors[which] > 1.0
     assert factors[1 - which] == EXACT
+
+
+def test_mean_square_of_sampled_errors_is_theirs_however_wrong_the_file_is() -> None:
+    rng, prior = np.random.default_rng(0), FilePrior(np.diag([1.0, 4.0, 0.25, 1.0]), np.repeat([0, 1], 2))
+    information = np.diag([1.0, 4.0, 0.0, 1.0])  # of the third one nothing is seen
+    squares, reported, n = np.zeros((4, 4)), np.zeros((4, 4)), 3000
+    for _ in range(n):
+        x = prior.of_each(rng.choice(_FACTORS, 2)) * np.sqrt(np.diag(prior.covariance)) * rng.standard_normal(4)
+        noise = np.array([1.0, 0.5, 0.0, 1.0]) * rng.standard_normal(4)
+        squares += np.outer(x, x) / n
+        reported += Evidence(information, information @ (x + noise)).mean_square(prior, np.zeros(4)) / n
+    assert np.diag(reported) == pytest.approx(np.diag(squares), rel=0.15)
+    assert np.abs(reported - squares).max() < 0.15 * squares.max()
+
+
+def test_mean_square_of_what_nothing_shows_is_not_that_of_an_exact_file() -> None:
+    prior = FilePrior(np.diag([1.0, 4.0]), np.array([0, 1]))
+    found = Evidence(np.diag([1e8, 0.0]), np.zeros(2)).mean_square(prior, np.zeros(2))
+    assert found[0, 0] < 1e-7
+    assert 1.0 < found[1, 1] / prior.covariance[1, 1] < MAX_FACTOR**2
 
 
 def test_forgotten_evidence_never_gains_and_keeps_the_mean_where_it_is_regular() -> None:
