@@ -149,7 +149,7 @@ class SelfCalibration:
         self, stamp_ns: int, instant_ns: int, odom_T_body: Float, motion: RelativeMotion | None, references: Set[int]
     ) -> None:
         """Add the motion of a frameset, before `add_frameset`; for arguments see `MotionGains.add`."""
-        self._gains.add(stamp_ns, instant_ns, odom_T_body, motion, references)
+        self._gains.add(stamp_ns, instant_ns, odom_T_body, motion, references, self._consider.newest_ns)
 
     def add_frameset(
         self,
