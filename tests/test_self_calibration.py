@@ -294,6 +294,23 @@ def test_self_calibration_errors_are_consistent_with_its_covariance() -> None:
     assert np.mean(normalised) < chi2.ppf(0.999, 8 * dimension) / 8
 
 
+def test_self_calibration_by_a_file_that_is_more_wrong_than_any_names_what_is_farthest_off() -> None:
+    true = default_rig().without_imu().with_pairs([0])
+    front = true.pairs[0]
+    wrong = replace(front.left, intrinsics=front.left.intrinsics * np.array([1.04, 1.04, 1.0, 1.0]))
+    calibration = SelfCalibration(replace(true, pairs=(replace(front, left=wrong),)))
+    assert calibration.implausible_parameter is None
+    found = calibrated(calibration, Walk(true), 8.0)
+    assert found.implausible_parameter in ("cam0.fx_px", "cam0.fy_px")
+    assert not found.has_full_window
+
+
+@pytest.mark.parametrize("level", [0, 3])
+def test_self_calibration_by_a_usual_file_finds_it_plausible(level: int) -> None:
+    written, true, _ = sampled(level, 0) if level else (default_rig(), default_rig(), None)
+    assert calibrated(SelfCalibration(written), Walk(true), 6.0).implausible_parameter is None
+
+
 def test_self_calibration_of_exact_files_leaves_them_alone() -> None:
     rig = default_rig()
     for seed in range(3):

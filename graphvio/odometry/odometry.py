@@ -248,7 +248,8 @@ class Odometry:
     def rig_warnings(self) -> list[str]:
         """Where the measurements contradict the rig: a sentence each, with the size and what is done about it."""
         off = [f"{finding}; {CORRECTED}" for finding in self.calibration_findings if finding.is_significant]
-        return self._vision_events.rig_warnings + off + self._imu.warnings + self._clocks.warnings
+        warnings = self._vision_events.rig_warnings + off + self._calibration.warnings
+        return warnings + self._imu.warnings + self._clocks.warnings
 
     @property
     def calibration(self) -> CalibrationEstimate | None:
