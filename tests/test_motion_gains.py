@@ -71,6 +71,17 @@ def test_framesets_that_nothing_needs_are_forgotten() -> None:
     assert gains.since(499) is None
 
 
+def test_gain_since_the_keyframe_that_was_adjusted_last_is_known_however_long_ago_it_was() -> None:
+    gains = MotionGains(RIG)
+    for k in range(500):
+        gains.add(k, 1000 + k, np.linalg.matrix_power(STEP, k % 7), None, NONE, None if k < 2 else 1001)
+        gains.note_keyframe()
+    found = gains.since(1001)
+    assert found is not None
+    assert found.by_cameras[:, extrinsics_of(RIG, 0)].any()
+    assert gains.since(1002) is None
+
+
 @pytest.mark.parametrize("stamp_ns", [0, 7])
 def test_gain_without_a_frameset_is_unknown(stamp_ns: int) -> None:
     assert MotionGains(RIG).since(stamp_ns) is None

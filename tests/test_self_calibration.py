@@ -23,7 +23,7 @@ from graphvio.self_calibration import solver, window_adjustment
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
 from graphvio.self_calibration.collector import FullWindow, WindowCollector
-from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.evidence import _FACTORS, EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector
@@ -210,6 +210,26 @@ def test_file_factors_of_what_two_groups_explain_are_those_of_the_likelier_one(w
     assert factors[1 - which] == EXACT
 
 
+def test_mean_square_of_sampled_errors_is_theirs_however_wrong_the_file_is() -> None:
+    rng, prior = np.random.default_rng(0), FilePrior(np.diag([1.0, 4.0, 0.25, 1.0]), np.repeat([0, 1], 2))
+    information = np.diag([1.0, 4.0, 0.0, 1.0])  # of the third one nothing is seen
+    squares, reported, n = np.zeros((4, 4)), np.zeros((4, 4)), 3000
+    for _ in range(n):
+        x = prior.of_each(rng.choice(_FACTORS, 2)) * np.sqrt(np.diag(prior.covariance)) * rng.standard_normal(4)
+        noise = np.array([1.0, 0.5, 0.0, 1.0]) * rng.standard_normal(4)
+        squares += np.outer(x, x) / n
+        reported += Evidence(information, information @ (x + noise)).mean_square(prior, np.zeros(4)) / n
+    assert np.diag(reported) == pytest.approx(np.diag(squares), rel=0.15)
+    assert np.abs(reported - squares).max() < 0.15 * squares.max()
+
+
+def test_mean_square_of_what_nothing_shows_is_not_that_of_an_exact_file() -> None:
+    prior = FilePrior(np.diag([1.0, 4.0]), np.array([0, 1]))
+    found = Evidence(np.diag([1e8, 0.0]), np.zeros(2)).mean_square(prior, np.zeros(2))
+    assert found[0, 0] < 1e-7
+    assert 1.0 < found[1, 1] / prior.covariance[1, 1] < MAX_FACTOR**2
+
+
 def test_forgotten_evidence_never_gains_and_keeps_the_mean_where_it_is_regular() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((5, 5))
@@ -272,6 +292,23 @@ def test_self_calibration_errors_are_consistent_with_its_covariance() -> None:
         normalised.append(off @ found.posterior.information @ off)
     dimension = 2 * PAIR
     assert np.mean(normalised) < chi2.ppf(0.999, 8 * dimension) / 8
+
+
+def test_self_calibration_by_a_file_that_is_more_wrong_than_any_names_what_is_farthest_off() -> None:
+    true = default_rig().without_imu().with_pairs([0])
+    front = true.pairs[0]
+    wrong = replace(front.left, intrinsics=front.left.intrinsics * np.array([1.04, 1.04, 1.0, 1.0]))
+    calibration = SelfCalibration(replace(true, pairs=(replace(front, left=wrong),)))
+    assert calibration.implausible_parameter is None
+    found = calibrated(calibration, Walk(true), 8.0)
+    assert found.implausible_parameter in ("cam0.fx_px", "cam0.fy_px")
+    assert not found.has_full_window
+
+
+@pytest.mark.parametrize("level", [0, 3])
+def test_self_calibration_by_a_usual_file_finds_it_plausible(level: int) -> None:
+    written, true, _ = sampled(level, 0) if level else (default_rig(), default_rig(), None)
+    assert calibrated(SelfCalibration(written), Walk(true), 6.0).implausible_parameter is None
 
 
 def test_self_calibration_of_exact_files_leaves_them_alone() -> None:

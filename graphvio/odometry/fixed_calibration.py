@@ -26,6 +26,11 @@ class FixedCalibration:
         """None."""
         return []
 
+    @property
+    def warnings(self) -> list[str]:
+        """None."""
+        return []
+
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Collect no windows."""
 

@@ -255,6 +255,7 @@ class Odometry:
             self._vision_events.rig_warnings
             + self._mistakes.warnings
             + off
+            + self._calibration.warnings
             + self._imu.warnings
             + self._clocks.warnings
         )

@@ -30,6 +30,10 @@ class OnlineCalibration(Protocol):
     def findings(self) -> list[Finding]:
         """What is known of each part of the calibration; empty where `estimate` is None."""
 
+    @property
+    def warnings(self) -> list[str]:
+        """What the images say against the rig file that is not corrected, a sentence each."""
+
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Register a function that gets windows of keyframes, from which a whole recording can be calibrated.
 

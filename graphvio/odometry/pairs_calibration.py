@@ -66,6 +66,7 @@ class PairsCalibration:
         self._averaged = 0
         self._epoch = 0
         self._is_reported = False
+        self._is_refusal_reported = False
         self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()  # pairs
         self._calibration = SelfCalibration(rig)
@@ -86,6 +87,17 @@ class PairsCalibration:
         """What is known of each part of the calibration; nothing is significant before a second window confirms it."""
         found = self._calibration.findings()
         return found if self._calibration.is_confirmed else [replace(each, is_significant=False) for each in found]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the images say against the rig file that is not corrected, a sentence each."""
+        name = self._calibration.implausible_parameter
+        if name is None:
+            return []
+        return [
+            "rig file: the images ask for a calibration that is farther from it than any file is wrong, most of all in "
+            f"{name}; it is not used, and poses are worse than their covariance says; calibrate again"
+        ]
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Register a function that gets each window before it is adjusted for the last time."""
@@ -140,6 +152,9 @@ class PairsCalibration:
             self._report(
                 stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated again"
             )
+        if self.warnings and not self._is_refusal_reported:
+            self._is_refusal_reported = True
+            self._report(stamp_ns, EventKind.CALIBRATION_REFUSED, self.warnings[0])
         margin_px = self._epipolar_margin_px()
         if not has_changed and margin_px == self._margin_px:
             return None

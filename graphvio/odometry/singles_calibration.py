@@ -69,6 +69,11 @@ class SinglesCalibration:
         """What is known of each part of the calibration; empty before the first pose."""
         return [] if self._estimate is None else findings(self._estimate, self._file_covariance)
 
+    @property
+    def warnings(self) -> list[str]:
+        """None: the estimator doubts a file that no motion fits."""
+        return []
+
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Collect windows for a function from now on: the estimator's own are others."""
         self._on_full_window = on_window

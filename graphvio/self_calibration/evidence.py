@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from graphvio.linear_algebra import cholesky, solve_lower
 EXACT = 1e-3
 """Factor on the file's standard deviations of a file that is as good as exact."""
 _SWEEPS = 3
+_MIN_WEIGHT = 1e-3  # of factors that count in a mean over all of them
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 MAX_FACTOR = _FACTORS[-1]
@@ -148,13 +150,26 @@ class Evidence(NamedTuple):
     def mean_square(self, prior: FilePrior, in_force: Float, likelihood: FactorLikelihood | None = None) -> Float:
         """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
 
-        It takes the factors of the file that are most likely, even while the file is in force as if it were exact. For
-        arguments see `file_factors`.
+        It is the mean over all factors of the file, each weighted by its likelihood, even while the file is in force as
+        if it were exact: what nothing has shown yet may be as wrong as any file is. For arguments see `file_factors`.
+
+        Raises:
+            numpy.linalg.LinAlgError: if the measurements have no likelihood with any factors.
         """
-        factors, _ = self.file_factors(prior, np.zeros(prior.n_groups), likelihood)
-        posterior = self.given(prior, factors)
-        off = posterior.mean - in_force
-        return np.asarray(posterior.covariance + np.outer(off, off))
+        likelihood = likelihood or FactorLikelihood(self, prior)
+        factors = [np.array(each) for each in product(_FACTORS, repeat=prior.n_groups)]
+        twice_log = np.array([likelihood(each) for each in factors])
+        if not np.isfinite(twice_log).any():
+            raise np.linalg.LinAlgError("the measurements fit no calibration")
+        weights = np.exp(0.5 * (twice_log - twice_log.max()))
+        weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
+        weights /= weights.sum()
+        mean_square = np.zeros_like(self.information)
+        for k in np.flatnonzero(weights):
+            posterior = self.given(prior, factors[k])
+            off = posterior.mean - in_force
+            mean_square += weights[k] * (posterior.covariance + np.outer(off, off))
+        return mean_square
 
 
 class FactorLikelihood:

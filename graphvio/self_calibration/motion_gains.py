@@ -64,6 +64,7 @@ class MotionGains:
         odom_T_body: Float,
         motion: RelativeMotion | None,
         references: Set[int],
+        since_ns: int | None = None,
     ) -> None:
         """Add a frameset, and forget those that nothing is measured from any more.
 
@@ -73,6 +74,8 @@ class MotionGains:
             odom_T_body: (4, 4) its pose.
             motion: By vision, which the pose follows, or None.
             references: Stamps of the framesets that later motions are measured from.
+            since_ns: Instant of the keyframe that was adjusted last, or None. While no adjustment comes into force, it
+                may be long ago.
         """
         since = None if motion is None else self._framesets.get(motion.reference_stamp_ns)
         gain = np.zeros((6, self._n))
@@ -83,7 +86,7 @@ class MotionGains:
             since = next(reversed(self._framesets.values()))
         if since is not None:
             gain = error_transport(since.pose.odom_T_body, odom_T_body) @ since.pose.by_cameras + gain
-        self._forget(references)
+        self._forget(references, since_ns)
         self._framesets[stamp_ns] = _Frameset(instant_ns, PoseGain(odom_T_body, gain))
 
     def note_keyframe(self) -> None:
@@ -102,10 +105,14 @@ class MotionGains:
         gain[:, self._extrinsics] += (carried - np.eye(6)) @ self._about_origin
         return PoseGain(newest.odom_T_body, gain)
 
-    def _forget(self, references: Set[int]) -> None:
+    def _forget(self, references: Set[int], since_ns: int | None) -> None:
         keyframes = [stamp_ns for stamp_ns, each in self._framesets.items() if each.is_keyframe]
         kept = references | set(keyframes[-_MAX_KEYFRAMES:])
-        self._framesets = {stamp_ns: each for stamp_ns, each in self._framesets.items() if stamp_ns in kept}
+        self._framesets = {
+            stamp_ns: each
+            for stamp_ns, each in self._framesets.items()
+            if stamp_ns in kept or each.instant_ns == since_ns
+        }
 
 
 def error_transport(then: Float, now: Float) -> Float:

@@ -25,7 +25,7 @@ from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
-from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
+from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters, parameter_names
 from graphvio.self_calibration.pixel_noise import pixel_noise
 from graphvio.self_calibration.prior import file_prior, walk_per_second
 from graphvio.self_calibration.window import View
@@ -94,6 +94,8 @@ class SelfCalibration:
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
+        self._implausible = 0  # the same, by which the rig file is more wrong than any
+        self._farthest = ""  # parameter in the newest of these
         self._sigma_px = FIRST_WINDOW_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
@@ -125,7 +127,7 @@ class SelfCalibration:
         self, stamp_ns: int, instant_ns: int, odom_T_body: Float, motion: RelativeMotion | None, references: Set[int]
     ) -> None:
         """Add the motion of a frameset, before `add_frameset`; for arguments see `MotionGains.add`."""
-        self._gains.add(stamp_ns, instant_ns, odom_T_body, motion, references)
+        self._gains.add(stamp_ns, instant_ns, odom_T_body, motion, references, self._consider.newest_ns)
 
     def add_frameset(
         self,
@@ -211,6 +213,11 @@ class SelfCalibration:
         return n_camera_parameters(self._rig)
 
     @property
+    def implausible_parameter(self) -> str | None:
+        """Name of the parameter that is farthest off where windows say that the rig file is more wrong than any."""
+        return self._farthest if self._implausible >= _MIN_CONFIRMING else None
+
+    @property
     def has_full_window(self) -> bool:
         """Whether what is known is based on a full window at least."""
         return self._used_windows > 0
@@ -231,15 +238,24 @@ class SelfCalibration:
             self._refuse(adjusted.is_full)
             return False
         if not (np.abs(calibration.mean) <= self._largest).all():  # also rejects NaN
+            self._note_implausible(adjusted)
             return False  # no rig file is so wrong: the measurements are
         # What a full window has confirmed, a part of one does not refute: it may be the scene's fault.
         is_confirmed = self.has_full_window and self.estimate.is_file_exact
         return adjusted.is_full or adjusted.estimate.is_file_exact or not is_confirmed
 
+    def _note_implausible(self, adjusted: AdjustedWindow) -> None:
+        """Count a full window that asks for a calibration by which the rig file is more wrong than any."""
+        mean = adjusted.solution.calibration.mean
+        if adjusted.is_full and np.isfinite(mean).all():
+            self._implausible += 1
+            excess = np.divide(np.abs(mean), self._largest, out=np.zeros_like(mean), where=self._largest > 0.0)
+            self._farthest = parameter_names(self._rig)[int(np.argmax(excess))]
+
     def _put_in_force(self, adjusted: AdjustedWindow) -> None:
         """Use an adjustment's result from now on, and its noise for the next windows."""
         if adjusted.is_full:
-            self._evidence, self._refused = adjusted.evidence, 0
+            self._evidence, self._refused, self._implausible = adjusted.evidence, 0, 0
             self._used_windows += 1
         solution, n = adjusted.solution, self._n_camera_parameters
         if (
