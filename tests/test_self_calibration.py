@@ -294,15 +294,39 @@ def test_self_calibration_errors_are_consistent_with_its_covariance() -> None:
     assert np.mean(normalised) < chi2.ppf(0.999, 8 * dimension) / 8
 
 
-def test_self_calibration_by_a_file_that_is_more_wrong_than_any_names_what_is_farthest_off() -> None:
+def test_self_calibration_corrects_a_file_that_is_more_wrong_than_any_once_two_windows_agree() -> None:
     true = default_rig().without_imu().with_pairs([0])
     front = true.pairs[0]
     wrong = replace(front.left, intrinsics=front.left.intrinsics * np.array([1.04, 1.04, 1.0, 1.0]))
-    calibration = SelfCalibration(replace(true, pairs=(replace(front, left=wrong),)))
-    assert calibration.implausible_parameter is None
-    found = calibrated(calibration, Walk(true), 8.0)
-    assert found.implausible_parameter in ("cam0.fx_px", "cam0.fy_px")
-    assert not found.has_full_window
+    written = replace(true, pairs=(replace(front, left=wrong),))
+    one_window = calibrated(SelfCalibration(written), Walk(true), 3.0)
+    assert not one_window.has_full_window
+    found = calibrated(SelfCalibration(written), Walk(true), 8.0)
+    assert found.has_full_window
+    assert found.implausible_parameter is None
+    np.testing.assert_allclose(found.estimate.rig.cameras[0].intrinsics, front.left.intrinsics, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "is_accepted"),
+    [
+        ("cam0.fx_px", (20.0, 20.0), True),
+        ("cam0.fx_px", (20.0, -20.0), False),
+        ("imu.accel_matrix.xx", (0.5, 0.5), False),
+    ],
+)
+def test_self_calibration_takes_what_two_windows_say_beyond_any_file_of_cameras_only(
+    name: str, values: tuple[float, float], is_accepted: bool
+) -> None:
+    calibration = SelfCalibration(default_rig())
+    names = parameter_names(default_rig())
+    accepted = []
+    for value in values:
+        mean = np.zeros(len(names))
+        mean[names.index(name)] = value
+        accepted.append(calibration._is_plausible(Gaussian(mean, 1e6 * np.eye(len(names))), is_full=True))
+    assert accepted == [False, is_accepted]
+    assert calibration.implausible_parameter == (None if is_accepted else name)
 
 
 @pytest.mark.parametrize("level", [0, 3])

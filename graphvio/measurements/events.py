@@ -65,8 +65,9 @@ class EventKind(StrEnum):
     CALIBRATION_CHANGED = "calibration_changed"
     """For some time the images contradict the calibration that was known, as after a knock; it is estimated again."""
     CALIBRATION_REFUSED = "calibration_refused"
-    """Two windows of keyframes ask for a calibration that is farther from the rig file than any file is wrong. It is
-    not used, and poses are worse than their covariance says; calibrate again."""
+    """Two windows of keyframes ask for a calibration that is farther from the rig file than any file is wrong, and do
+    not agree on it, or it is the IMU's. It is not used, and poses are worse than their covariance says: calibrate
+    again."""
     EXTRINSICS_OFF = "extrinsics_off"
     """The pairs' motions contradict the rig's transform between them; it is corrected for this run. Or the scale of
     single cameras' overlapping views contradicts the accelerometer's; overlaps are not used from then on."""

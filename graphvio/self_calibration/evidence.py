@@ -50,6 +50,12 @@ class Gaussian(NamedTuple):
         """Return whether the posterior mean is within this prior: squared Mahalanobis distance below 3 a parameter."""
         return 2.0 * self.cost(posterior.mean) < _MAX_MEAN_INNOVATION * len(self.mean)
 
+    def agrees_with(self, other: Gaussian) -> bool:
+        """Return whether two estimates differ by no more than their covariances explain, by the same bound."""
+        apart = self.mean - other.mean
+        statistic = float(apart @ np.linalg.solve(self.covariance + other.covariance, apart))
+        return statistic < _MAX_MEAN_INNOVATION * len(apart)
+
 
 class FilePrior(NamedTuple):
     """What is known of the calibration from the rig file, up to a factor on the standard deviations of each group.

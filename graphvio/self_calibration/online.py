@@ -21,7 +21,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence
+from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
@@ -94,8 +94,8 @@ class SelfCalibration:
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
-        self._implausible = 0  # the same, by which the rig file is more wrong than any
-        self._farthest = ""  # parameter in the newest of these
+        self._implausible: list[Gaussian] = []  # calibrations by the same, by which the file is more wrong than any
+        self._is_beyond_any = False  # the file is more wrong than any, as two full windows agree
         self._sigma_px = FIRST_WINDOW_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
@@ -214,8 +214,15 @@ class SelfCalibration:
 
     @property
     def implausible_parameter(self) -> str | None:
-        """Name of the parameter that is farthest off where windows say that the rig file is more wrong than any."""
-        return self._farthest if self._implausible >= _MIN_CONFIRMING else None
+        """Name of the parameter that is farthest off where windows say that the rig file is more wrong than any.
+
+        None while there is but one such window, and once two have agreed, as the calibration is corrected then.
+        """
+        if self._is_beyond_any or len(self._implausible) < _MIN_CONFIRMING:
+            return None
+        mean = self._implausible[-1].mean
+        excess = np.divide(np.abs(mean), self._largest, out=np.zeros_like(mean), where=self._largest > 0.0)
+        return parameter_names(self._rig)[int(np.argmax(excess))]
 
     @property
     def has_full_window(self) -> bool:
@@ -237,25 +244,31 @@ class SelfCalibration:
         if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
             self._refuse(adjusted.is_full)
             return False
-        if not (np.abs(calibration.mean) <= self._largest).all():  # also rejects NaN
-            self._note_implausible(adjusted)
-            return False  # no rig file is so wrong: the measurements are
+        if not (self._is_beyond_any or self._is_plausible(calibration, adjusted.is_full)):
+            return False
         # What a full window has confirmed, a part of one does not refute: it may be the scene's fault.
         is_confirmed = self.has_full_window and self.estimate.is_file_exact
         return adjusted.is_full or adjusted.estimate.is_file_exact or not is_confirmed
 
-    def _note_implausible(self, adjusted: AdjustedWindow) -> None:
-        """Count a full window that asks for a calibration by which the rig file is more wrong than any."""
-        mean = adjusted.solution.calibration.mean
-        if adjusted.is_full and np.isfinite(mean).all():
-            self._implausible += 1
-            excess = np.divide(np.abs(mean), self._largest, out=np.zeros_like(mean), where=self._largest > 0.0)
-            self._farthest = parameter_names(self._rig)[int(np.argmax(excess))]
+    def _is_plausible(self, calibration: Gaussian, is_full: bool) -> bool:
+        """Return whether the rig file can be as wrong as a window says.
+
+        Where it is more wrong than any file, the window is at fault, unless the full one before says the same of the
+        cameras. An IMU that is so wrong is none to be calibrated.
+        """
+        is_plausible = np.abs(calibration.mean) <= self._largest  # also rejects NaN
+        if is_plausible.all():
+            return True
+        if is_full and np.isfinite(calibration.mean).all():
+            agree = bool(self._implausible) and calibration.agrees_with(self._implausible[-1])
+            self._is_beyond_any = agree and bool(is_plausible[self._n_camera_parameters :].all())
+            self._implausible.append(calibration)
+        return self._is_beyond_any
 
     def _put_in_force(self, adjusted: AdjustedWindow) -> None:
         """Use an adjustment's result from now on, and its noise for the next windows."""
         if adjusted.is_full:
-            self._evidence, self._refused, self._implausible = adjusted.evidence, 0, 0
+            self._evidence, self._refused, self._implausible = adjusted.evidence, 0, []
             self._used_windows += 1
         solution, n = adjusted.solution, self._n_camera_parameters
         if (
