@@ -17,6 +17,6 @@ def _plot_calibration(_: CalibrationHistory, path: Path, *__: Any) -> None:
     path.write_bytes(b"")
 
 
-if __name__ == "__main__":  # not in processes that it starts itself
+if __name__ == "__main__":  # not in its own processes
     with patch.object(writer, "plot_run", _plot_run), patch.object(CalibrationHistory, "plot", _plot_calibration):
         main()
