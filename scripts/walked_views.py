@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -13,12 +14,19 @@ from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, DISTORTION, PAIR, STEREO, RigCalibration
 from graphvio.self_calibration.window import View
 from graphvio.simulation.imu import measure
+from graphvio.simulation.motion import Motion
 from graphvio.simulation.scenes import build_scene
 
 RATE_HZ = 20.0
 _POINTS = 1500
 _ROOM_M = np.array([4.0, 4.0, 2.0])
 _MAX_TRACKS = 150
+
+
+@cache
+def _motion_of(scene: str) -> Motion:
+    """Return the walk through a scene, which is in motion from its first instant."""
+    return build_scene(scene, None, 0.0).motion
 
 
 @dataclass
@@ -40,7 +48,7 @@ class Walk:
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
-        self._motion = build_scene(self.scene, None, 0.0).motion
+        self._motion = _motion_of(self.scene)
         centre = self._motion.at(np.array([0.0])).world_T_body[0, :3, 3]
         directions = self._rng.standard_normal((_POINTS, 3))
         directions /= np.abs(directions).max(axis=1, keepdims=True)
@@ -56,21 +64,24 @@ class Walk:
         body = np.linalg.inv(world_T_body)
         views = {}
         for j, group in enumerate(self.rig.groups):
-            in_left = self._points @ (group.left.cam_T_body @ body)[:3, :3].T + (group.left.cam_T_body @ body)[:3, 3]
+            left_T_world = group.left.cam_T_body @ body
+            in_left = self._points @ left_T_world[:3, :3].T + left_T_world[:3, 3]
             left, seen = group.left.project(in_left)
-            right, matched = np.zeros_like(left), np.zeros_like(seen)
+            ids = np.flatnonzero(seen)[:_MAX_TRACKS]
+            left, in_left = left[ids], in_left[ids]
+            right, matched = np.zeros_like(left), np.zeros(len(ids), dtype=bool)
             if isinstance(group, StereoPair):
                 in_right = in_left @ group.right_T_left[:3, :3].T + group.right_T_left[:3, 3]
                 right, matched = group.right.project(in_right)
-            ids = np.flatnonzero(seen)[:_MAX_TRACKS]
             noise = self.sigma_px * self._rng.standard_normal((2, len(ids), 2))
-            views[j] = View(ids, left[ids] + noise[0], right[ids] + noise[1], matched[ids], 1.0 / in_left[ids, 2])
+            views[j] = View(ids, left + noise[0], right + noise[1], matched, 1.0 / in_left[:, 2])
         return views
 
     def framesets(self, duration_s: float) -> Iterator[tuple[int, Float, dict[int, View]]]:
         """Yield stamps, true poses and views."""
-        for k in range(int(duration_s * RATE_HZ)):
-            pose = self.pose(k / RATE_HZ)
+        seconds = np.arange(int(duration_s * RATE_HZ)) / RATE_HZ
+        poses = self._motion.at(seconds * self.speed).world_T_body
+        for k, pose in enumerate(poses):
             yield round(k * 1e9 / RATE_HZ), pose, self.views(pose)
 
     def samples(self, duration_s: float) -> list[ImuSample]:

@@ -21,21 +21,22 @@ settings.register_profile("graphvio", deadline=None, derandomize=True)
 settings.load_profile("graphvio")
 
 
-# Files that take from three minutes to five seconds, in this order.
+# Files that take from a minute to two seconds, in this order.
 _LONGEST = (
-    "optimize", "monocular", "page_code", "outages", "imu_watch", "cli_slam", "fleet", "self_calibration",
-    "hard_moments", "recorded_calibration", "end_to_end", "warmup", "corridor", "frontend_covariance", "optimization",
-    "fleet_s3", "tutorials", "calibrate", "examples", "live", "benchmark", "mapping", "odometry", "keyframes",
-    "json_output", "start_in_motion", "calibration_trajectories", "backend_smoother", "calibration_memory", "kernels",
-    "convert", "calibration_methods", "cli_live", "ekf_estimator", "calibration_pair", "calibration_several",
-    "backend_shared_error", "unsynchronised", "live_sources", "single_cameras", "slam_service", "docs", "map_frame",
-    "simulation_scenes", "ros2_source", "cli_serve", "image_masks", "calibration_start", "slam_single_cameras",
-    "sources", "sessions", "overlaps", "colmap_export", "frontend_lucas_kanade", "clock_map", "nav_frame",
-    "ros2_publisher", "slam_fuzz", "cli_warming", "image_noise", "ros2_package", "sources_units",
-    "cli_calibrate_trajectories", "simulation_calibration_error", "site", "calibration_imu", "real_imu",
-    "calibration_motions", "live_oak", "cli_program", "frontend_tracker", "ekf_graph", "imu_noise", "frontend_motion",
-    "frontend_extrinsic_monitor", "cli_compare", "evaluation", "spike_filter", "stamp_jitter", "viewer_web",
-    "lens_models", "calibration_curves",
+    "monocular", "page_code", "optimize", "cli_slam", "outages", "end_to_end", "imu_watch", "examples", "live",
+    "warmup", "frontend_covariance", "hard_moments", "corridor", "recorded_calibration", "mapping",
+    "self_calibration", "calibrate", "slam_service", "unsynchronised", "odometry", "tutorials", "optimization",
+    "keyframes", "ros2_source", "cli_live", "fleet_s3", "json_output", "fleet", "cli_serve", "kernels",
+    "start_in_motion", "calibration_trajectories", "simulation_scenes", "backend_smoother", "convert",
+    "calibration_start", "backend_shared_error", "benchmark", "calibration_methods", "calibration_several",
+    "frontend_lucas_kanade", "slam_single_cameras", "calibration_pair", "slam_fuzz", "calibration_memory",
+    "sessions", "single_cameras", "nav_frame", "overlaps", "site", "docs", "image_masks", "cli_warming",
+    "simulation_calibration_error", "sources", "live_oak", "image_noise", "ros2_package", "colmap_export",
+    "real_imu", "cli_calibrate_trajectories", "ros2_publisher", "ekf_estimator", "simulation_rendering",
+    "linear_algebra", "simulation_recording", "rig_files", "ekf_graph", "calibration_curves", "clock_map",
+    "plotting", "simulation_named_rigs", "time_offset", "turning_on_the_spot", "frontend_tracker", "map_frame",
+    "trajectory_formats", "simulation_motion", "frontend_slanted", "optimization_report", "cli_program",
+    "self_calibration_singles", "live_sources", "stamp_jitter", "calibration_imu", "ros2_discovery", "interrupts",
 )  # fmt: skip
 _RANKS = {f"test_{name}": rank for rank, name in enumerate(_LONGEST)}
 

@@ -188,14 +188,13 @@ def _cast(
     valid &= (hit >= 0) & (conditions.depth_scale > conditions.min_depth_m * inverse_depth)
     homogeneous = np.column_stack([rays, np.ones(len(rays))])
     points = homogeneous[valid] * (conditions.depth_scale / inverse_depth[valid, None])
-    keep = np.ones(len(points), dtype=bool)
     if conditions.choice is not None:
-        keep = conditions.choice(pixels[valid], points)
+        points = points[conditions.choice(pixels[valid], points)]
     world = points @ world_T_left[:3, :3].T + world_T_left[:3, 3]
     for pose in poses:
         for camera in (pair.left, pair.right):
-            keep &= camera.project(_moved(camera.cam_T_body @ se3_inverse(pose), world))[1]
-    return np.asarray(world[keep])
+            world = world[camera.project(_moved(camera.cam_T_body @ se3_inverse(pose), world))[1]]
+    return np.asarray(world)
 
 
 def _moved(a_T_b: Float, points: Float) -> Float:

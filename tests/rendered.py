@@ -7,6 +7,7 @@ import hashlib
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,7 @@ _TAKE_NO_PART = frozenset(  # in what is written: they read, raise, or compile
     ("graphvio.rig_files", "graphvio.rig_files.reading", "graphvio.errors", "graphvio.wording",
      "graphvio.kernel_cache", "graphvio.compiled_code")
 )  # fmt: skip
+_KEPT_S = 6 * 3600.0  # after their last use: another checkout, whose simulator differs, may be at its tests
 _UNCOMPRESSED = (cv2.IMWRITE_PNG_COMPRESSION, 0, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)
 
 
@@ -56,7 +58,8 @@ def _digest() -> str:
 def rendered_once(name: str, write: Callable[[Path], object], *options: object) -> Path:
     """Return a folder with a recording, which is rendered if no run of the tests has done so before.
 
-    Nobody may write into it. It is kept in the user's cache, by the digest of the sources that determine its bytes.
+    Nobody may write into it. It is kept in the user's cache, by the digest of the sources that determine its bytes;
+    those by other digests are removed some hours after their last use.
 
     Args:
         name: Name of the folder.
@@ -70,13 +73,15 @@ def rendered_once(name: str, write: Callable[[Path], object], *options: object) 
     with (cache / f"{which}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # whichever process comes first renders it for all
         if not folder.exists():
-            for outdated in [path for path in cache.glob(f"{which}.*") if path.is_dir()]:
-                shutil.rmtree(outdated)
+            for other in [path for path in cache.glob(f"{which}.*") if path.is_dir()]:
+                if other == folder.parent or time.time() - other.stat().st_mtime > _KEPT_S:  # its own was not finished
+                    shutil.rmtree(other)
             folder.parent.mkdir()
             unfinished = folder.with_name(".unfinished")
             write(unfinished)
             _uncompress(unfinished)
             unfinished.rename(folder)
+        os.utime(folder.parent)
     return folder
 
 

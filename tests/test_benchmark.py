@@ -116,6 +116,7 @@ def test_benchmark_writes_table_document_and_report_where_one_sequence_fails(tmp
     assert 'href="report.html"' in page
 
 
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").is_dir(), reason="the clip of EuRoC is not there")
 def test_benchmark_of_the_clip_stands_beside_published_figures(tmp_path: Path) -> None:
     ran = graphvio("benchmark", "euroc", REAL_DATA / "euroc_mh01_clip", "--out", tmp_path / "out", "--to", 2)

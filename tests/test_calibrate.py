@@ -13,6 +13,7 @@ import yaml
 from calibration_walks import Course, on_the_spot, planar, recorded, straight, with_wrong_place
 from scipy.stats import chi2
 from typer.testing import CliRunner, Result
+from undrawn import undrawn
 
 from graphvio import Calibration, CalibrationError, Rig, calibrate_pairs, load_rig, open_source, save_rig
 from graphvio.arrays import Float
@@ -96,7 +97,8 @@ def test_command_wrong_rig_is_corrected(walk: Path, tmp_path: Path) -> None:
     rig = load_rig(walk / "rig.yaml")
     wrong, out, report = tmp_path / "wrong.yaml", tmp_path / "right.yaml", tmp_path / "report"
     save_rig(with_wrong_place(rig, 3.0, 0.05), wrong)
-    ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
+    with undrawn():
+        ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
     assert ran.exit_code == 0
     found = {}
     for part, unit in (("rotation", "deg"), ("translation", "mm")):

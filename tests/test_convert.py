@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from real_clip import CLIP, real_clip
+from real_clip import CLIP, half_size_clip
 from recordings import frame_stamps, small_rig, write_euroc, write_kitti_odometry, write_rows
 from test_sessions import same
 from typer.testing import CliRunner
@@ -306,7 +306,7 @@ def test_bag_messages_are_read_in_any_order(recording: Path, tmp_path: Path) -> 
 def trajectory_of_the_clip(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     if not CLIP.is_dir():
         pytest.skip("shared/data/euroc_mh01_clip is absent")
-    return trajectory_of(real_clip(), tmp_path_factory.mktemp("clip") / "results", *CLIP_PIECE)
+    return trajectory_of(half_size_clip(), tmp_path_factory.mktemp("clip") / "results", *CLIP_PIECE)
 
 
 def trajectory_of(source: Path, out: Path, *options: str) -> bytes:
@@ -323,6 +323,6 @@ def test_real_recording_gives_equal_results_from_all_formats(
     """From the MCAP file that ``record`` makes while the odometry runs, and from bags of ROS 1 and ROS 2."""
     verb = ["record"] if name == "recorded.mcap" else ["convert"]
     kind = ["--format", "rosbag2"] if name == "clip" else []
-    made = CliRunner().invoke(app, [*verb, str(real_clip()), "--out", str(tmp_path / name), *kind, *CLIP_PIECE])
+    made = CliRunner().invoke(app, [*verb, str(half_size_clip()), "--out", str(tmp_path / name), *kind, *CLIP_PIECE])
     assert made.exit_code == 0, made.output
     assert trajectory_of(tmp_path / name, tmp_path / "results") == trajectory_of_the_clip

@@ -54,6 +54,7 @@ def test_the_python_of_self_calibration_runs_as_typed(walk: Path) -> None:
     assert load_rig(walk / "rig-refined.yaml").imu is not None
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_the_commands_of_self_calibration_run_as_typed(walk: Path) -> None:
     lines = re.findall(r"^    graphvio (.*?)(?:  +#.*)?$", SELF_CALIBRATION, re.MULTILINE)
     assert len(lines) == 3

@@ -1,4 +1,4 @@
-"""Eight sessions on two workers, one of which is killed; what is missing is done later; storage that is not local."""
+"""Six sessions on two workers, one of which is killed; what is missing is done later; storage that is not local."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import dask
 import fsspec
 import pytest
 from calibration_walks import recorded
@@ -33,7 +34,7 @@ from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
-SESSIONS, FRAMES, CORRUPT = 8, 18, "walk-05"
+SESSIONS, FRAMES, CORRUPT = 6, 18, "walk-05"
 PLACES_PER_TASK = 2
 CONFIG = """
 calibration: {online: false}  # a second shows nothing of it
@@ -91,7 +92,8 @@ def cluster() -> Iterator[Any]:
 
 
 def local_cluster(*preloads: str) -> Any:
-    """Two workers, whose short runs would mostly plot."""
+    """Two workers, whose short runs would mostly plot; on a busy machine a killed one is not back within 15 s."""
+    dask.config.set({"distributed.deploy.lost-worker-timeout": "120 s"})
     preload = [str(Path(__file__).with_name(name)) for name in ("undrawn.py", *preloads)]
     return LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", preload=preload
@@ -130,7 +132,7 @@ class Done:
 @pytest.fixture(scope="module")
 def done(folder: Path, config: Config, cluster: Any) -> Done:
     warm_up(open_source(folder / "whole").rig, config)
-    out, killer = folder / "out", Killer(cluster, after=12)
+    out, killer = folder / "out", Killer(cluster, after=9)
     outcomes = optimize_fleet(
         list_sessions(str(folder / "sessions")),
         str(out),
@@ -193,7 +195,7 @@ def test_fleet_table_has_every_session(done: Done) -> None:
             assert float(row["cost_after"]) <= float(row["cost_before"])
             assert all(float(row[f"{stage}_wall_s"]) > 0.0 for stage in ("odometry", "features", "loops", "graph"))
     page = (done.out / "summary.html").read_text()
-    assert "8 sessions, 7 optimised, 1 failed" in page
+    assert "6 sessions, 5 optimised, 1 failed" in page
     assert page.count("<tr") == 1 + SESSIONS
     assert "://" not in page
 
@@ -212,21 +214,21 @@ def test_fleet_again_does_only_what_is_missing(done: Done, folder: Path, cluster
     listed.write_text("# all\n" + "".join(f"{each.recording}\n" for each in moved))
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     (out / "walk-03" / "trajectory_optimized.txt").unlink()
-    (out / "walk-06" / "loops.npz").unlink()
+    (out / "walk-04" / "loops.npz").unlink()
     result = command(folder, listed, "--out", out, "--scheduler", cluster.scheduler_address)
     assert result.exit_code == 3, result.output
     assert f"{CORRUPT} failed in odometry: " in result.output
-    assert "7 of 8 sessions optimised" in result.output
+    assert "5 of 6 sessions optimised" in result.output
     changed = {str(path.relative_to(out)) for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
-    assert {name.split("/")[0] for name in changed} == {"walk-03", "walk-06", "summary.csv", "summary.html"}
+    assert {name.split("/")[0] for name in changed} == {"walk-03", "walk-04", "summary.csv", "summary.html"}
     marker = json.loads((out / "walk-03/stages/graph.json").read_text())
     made = {"database.db", "stages/graph.json", *marker["files"]}
     assert {"trajectory_optimized.txt", "covariance.csv", "graph.g2o", "report.html"} <= made
     assert {name for name in changed if name.startswith("walk-03")} == {f"walk-03/{name}" for name in made}
     assert not any(name.endswith(("record.npz", "odometry.json")) for name in changed)
-    for name in ("walk-03/trajectory_optimized.txt", "walk-06/loops.npz", "walk-06/graph.g2o"):
+    for name in ("walk-03/trajectory_optimized.txt", "walk-04/loops.npz", "walk-04/graph.g2o"):
         assert (out / name).read_bytes() == (done.out / name).read_bytes()
-    for name in ("walk-03", "walk-06"):
+    for name in ("walk-03", "walk-04"):
         assert rows(out / name / "database.db") == rows(done.out / name / "database.db")
 
 
@@ -234,7 +236,7 @@ def test_fleet_other_input_is_refused(folder: Path, cluster: Any, tmp_path: Path
     (tmp_path / "sessions").mkdir()
     shutil.copytree(folder / "sound", tmp_path / "sessions" / CORRUPT)
     arguments = (tmp_path / "sessions", "--out", tmp_path / "out")
-    result = command(folder, *arguments, "--workers", 1)
+    result = command(folder, *arguments, "--scheduler", cluster.scheduler_address)
     assert result.exit_code == 0, result.output
     assert "1 of 1 sessions optimised" in result.output
     other = command(folder, *arguments, "--no-loops", "--scheduler", cluster.scheduler_address)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -127,6 +127,29 @@ def exact(vga_walk: Path, measurements: list[Measurement]) -> Walk:
     return Walk(vga_walk, measurements, as_it_is)
 
 
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """The walk as it is once more, and how many matches of its images were thrown out, by the reason."""
+
+    walk: Walk
+    thrown_out: Counter[str]
+
+
+@pytest.fixture(scope="module")
+def counted(vga_walk: Path, measurements: list[Measurement]) -> Counted:
+    thrown_out: Counter[str] = Counter()
+    match = StereoMatcher.match
+
+    def counting(self: StereoMatcher, *arguments: Any) -> StereoMatches:
+        matches = match(self, *arguments)
+        thrown_out.update(matches.rejected)
+        return matches
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StereoMatcher, "match", counting)
+        return Counted(Walk(vga_walk, measurements, as_it_is), thrown_out)
+
+
 def as_it_is(_: float, frameset: FrameSet) -> FrameSet:
     return frameset
 
@@ -162,7 +185,7 @@ def noise_like(image: Image, level: float, seed: int) -> Image:
     return np.asarray(np.random.default_rng(seed).normal(level, 2.0, image.shape).clip(0, 255), dtype=np.uint8)
 
 
-def test_the_walk_as_it_is(vga_walk: Path, measurements: list[Measurement], exact: Walk) -> None:
+def test_the_walk_as_it_is(exact: Walk, counted: Counted) -> None:
     walk = exact
     assert walk.end_error_m < 0.004
     assert walk.worst < 45.0
@@ -176,8 +199,7 @@ def test_the_walk_as_it_is(vga_walk: Path, measurements: list[Measurement], exac
     assert np.mean(stationary[6:19]) > 0.9  # the first second, of which a quarter goes by before it can be detected
     assert not any(stationary[:5])
     assert not any(stationary[40:])  # and then it has begun to walk
-    again = Walk(vga_walk, measurements, as_it_is)
-    for one, other in zip(walk.estimates, again.estimates, strict=True):
+    for one, other in zip(walk.estimates, counted.walk.estimates, strict=True):
         assert np.array_equal(one.nav_T_body, other.nav_T_body)  # type: ignore[arg-type]
         assert np.array_equal(one.covariance, other.covariance)  # type: ignore[arg-type]
 
@@ -209,24 +231,13 @@ def test_error_of_p12_is_reported_and_corrected(vga_walk: Path, measurements: li
     assert all(estimate.epoch == 0 for estimate in walk.estimates)
 
 
-def test_all_that_stereo_matching_threw_out_is_reported(
-    vga_walk: Path, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_that_stereo_matching_threw_out_is_reported(counted: Counted) -> None:
     """Also of the search for new corners, when the reference changes."""
-    thrown_out: Counter[str] = Counter()
-    match = StereoMatcher.match
-
-    def counted(self: StereoMatcher, *arguments: Any) -> StereoMatches:
-        matches = match(self, *arguments)
-        thrown_out.update(matches.rejected)
-        return matches
-
-    monkeypatch.setattr(StereoMatcher, "match", counted)
-    walk = Walk(vga_walk, measurements, as_it_is)
     reported: Counter[str] = Counter()
-    for estimate in walk.estimates:
+    for estimate in counted.walk.estimates:
         for report in estimate.pairs.values():
             reported.update(report.rejected)
+    thrown_out = counted.thrown_out
     assert sum(thrown_out.values()) > 1000
     assert {name: reported[name] for name in thrown_out} == dict(thrown_out)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from real_clip import CLIP, real_clip
+from real_clip import CLIP, half_size_clip
 
 from graphvio import FrameSet, ImuSample, Odometry, open_source
 from graphvio.backend.inertial import ImuBuffer
@@ -55,11 +55,11 @@ def test_interval_has_the_noise_of_samples_before_it() -> None:
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_imu_with_eight_times_the_stated_noise() -> None:
     """By the stated noise, good images contradict the IMU: they were refused, the rig was lost, the IMU left out."""
-    source, rng = open_source(real_clip()), np.random.default_rng(2)
+    source, rng = open_source(half_size_clip()), np.random.default_rng(2)
     assert source.rig.imu is not None
     sigmas = 8.0 * np.sqrt(200.0) * np.repeat(source.rig.imu.noise_densities, 3)
     odometry, estimates = Odometry(source.rig), []
-    for measurement in open_source(real_clip(), to_s=12.0):
+    for measurement in open_source(half_size_clip(), to_s=12.0):
         if not isinstance(measurement, FrameSet):
             noise = sigmas * rng.standard_normal(6)
             rate, force = measurement.angular_velocity + noise[:3], measurement.linear_acceleration + noise[3:]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calibration_walks import recorded, walk_simulator, with_wrong_place
-from real_clip import CLIP, real_clip
+from real_clip import CLIP, half_size_clip
 from rendered import copy_part
 from typer.testing import CliRunner, Result
 from undrawn import undrawn
@@ -357,7 +357,7 @@ def test_optimize_real_recording_improves_on_online(tmp_path: Path) -> None:
     errors = {}
     for config in ("default", tmp_path / "as_it_is.yaml"):
         out = tmp_path / Path(config).stem
-        done = command(real_clip(), "--config", config, "--out", out)
+        done = command(half_size_clip(), "--config", config, "--out", out)
         assert done.exit_code == 0, done.output
         (session,) = json.loads((out / "summary.json").read_text())["sessions"]
         errors[out.name] = {name: each["position_m"] for name, each in session["ate_rmse"].items()}

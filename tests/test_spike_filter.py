@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from real_clip import CLIP, real_clip
+from real_clip import CLIP, half_size_clip
 
 from graphvio import FrameSet, ImuSample, Odometry, open_source
 from graphvio.arrays import Float
@@ -153,9 +153,9 @@ def test_real_flights_have_no_spikes_with_half_the_limits(recording: str, monkey
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_odometry_with_spikes_is_as_good_as_without() -> None:
     """One sample a second is off: the path was wrong by decimetres, and vision was refused."""
-    source, rng = open_source(real_clip()), np.random.default_rng(5)
+    source, rng = open_source(half_size_clip()), np.random.default_rng(5)
     odometry, estimates, framesets = Odometry(source.rig), [], 0
-    for measurement in open_source(real_clip(), to_s=10.0):
+    for measurement in open_source(half_size_clip(), to_s=10.0):
         each = measurement
         if isinstance(each, ImuSample) and rng.random() < 0.005:
             wrong_rate, wrong_force = 20.0 * rng.standard_normal(3), 100.0 * rng.standard_normal(3)

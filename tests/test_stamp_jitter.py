@@ -7,7 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from real_clip import CLIP, real_clip
+from real_clip import CLIP, half_size_clip
 
 from graphvio import FrameSet, Imu, Odometry, open_source
 from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
@@ -93,10 +93,10 @@ def test_covariance_of_an_interval_covers_what_its_stamps_err_by() -> None:
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")
 def test_images_that_are_stamped_when_they_arrive() -> None:
     """By intervals that are wrong by 4 ms, the IMU contradicted good images: it was left out, its scale corrected."""
-    source, rng = open_source(real_clip()), np.random.default_rng(5)
+    source, rng = open_source(half_size_clip()), np.random.default_rng(5)
     measurements = [
         replace(each, stamp_ns=each.stamp_ns + int(rng.normal(0.0, 3e6))) if isinstance(each, FrameSet) else each
-        for each in open_source(real_clip(), to_s=12.0)
+        for each in open_source(half_size_clip(), to_s=12.0)
     ]
     odometry = Odometry(source.rig)
     estimates = [odometry.process(each) for each in sorted(measurements, key=lambda each: each.stamp_ns)]

@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from rendered import rendered_once
 
-from graphvio import ImuSample, Odometry
+from graphvio import Odometry, open_source
 from graphvio.arrays import Float
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.motion import CameraTracks, VisualResult
-from graphvio.simulation import build_scene, default_rig
+from graphvio.simulation import build_scene, default_rig, write_recording
 from graphvio.simulation.motion import Motion
 from graphvio.simulation.simulator import Simulator
 
@@ -41,8 +42,11 @@ def course(times: Float) -> Float:
 def turned() -> Turned:
     scene = replace(build_scene("room"), motion=Motion(course, DURATION_S))
     rig = default_rig().with_only(["cam0"])
-    simulator, odometry = Simulator(scene, rig), Odometry(rig)
-    process, camera_tracks = odometry._frontend.process, list[CameraTracks]()
+    simulator = Simulator(scene, rig)
+    path = simulator.world_T_body.tobytes()
+    source = open_source(rendered_once("on-the-spot", lambda folder: write_recording(simulator, folder), path))
+    odometry, camera_tracks = Odometry(source.rig), list[CameraTracks]()
+    process = odometry._frontend.process
 
     def listened(*args: object) -> VisualResult:
         visual = process(*args)  # type: ignore[arg-type]
@@ -50,13 +54,7 @@ def turned() -> Turned:
         return visual
 
     odometry._frontend.process = listened  # type: ignore[method-assign,assignment]
-    track, n_samples, estimates = simulator.imu_track, 0, list[Estimate | None]()
-    for k, stamp_ns in enumerate(simulator.stamps_ns):
-        while track.stamps_ns[n_samples] <= stamp_ns:
-            values = track.angular_velocity[n_samples], track.linear_acceleration[n_samples]
-            estimates.append(odometry.process(ImuSample(int(track.stamps_ns[n_samples]), *values)))
-            n_samples += 1
-        estimates.append(odometry.process(simulator.frameset(k)))
+    estimates: list[Estimate | None] = [odometry.process(measurement) for measurement in source]
     world_R_cam = simulator.world_T_body[:, :3, :3] @ rig.cameras[0].body_T_cam[:3, :3]
     statuses = [estimate.status for estimate in estimates if estimate is not None]
     return Turned(statuses, [event.kind for event in odometry.take_events()], camera_tracks, world_R_cam)

@@ -34,6 +34,7 @@ def follow(name: str, recording: Path, folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_first_trajectory_as_typed(room_walk: Path, tmp_path: Path) -> None:
     printed = follow("first-trajectory", room_walk, tmp_path)
     assert printed.count("tracking") >= 95

@@ -3,6 +3,7 @@
 It is also a preload of dask's workers.
 """
 
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ from unittest.mock import patch
 
 from matplotlib.figure import Figure
 
+from graphvio.benchmark import run as benchmark
 from graphvio.calibration.report import page
 from graphvio.fleet import cluster
 from graphvio.optimization.report import figures, write
@@ -53,10 +55,13 @@ _PLOTS: tuple[tuple[Any, str, Any], ...] = (
 
 @contextmanager
 def undrawn() -> Iterator[None]:
-    """Leave the plots of results empty, here and in workers that are started here."""
-    preloads = [*cluster.WORKER_PRELOADS, __file__]
+    """Leave the plots of results empty, here and in workers and runs of a benchmark that are begun here."""
+    elsewhere = (
+        (cluster, "WORKER_PRELOADS", [*cluster.WORKER_PRELOADS, __file__]),
+        (benchmark, "RUN", (sys.executable, str(Path(__file__).with_name("undrawn_run.py")), "run")),
+    )
     with ExitStack() as patches:
-        for module, name, instead in (*_PLOTS, (cluster, "WORKER_PRELOADS", preloads)):
+        for module, name, instead in (*_PLOTS, *elsewhere):
             patches.enter_context(patch.object(module, name, instead))
         yield
 

@@ -22,6 +22,8 @@ from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
+RUN = (sys.executable, "-m", "graphvio", "run")
+"""The program that runs a sequence, in a process of its own."""
 _NS_PER_S = 1e9
 _INCOMPLETE = 3  # exit code of ``graphvio run`` where less than 90 % of the framesets have a pose
 
@@ -122,7 +124,7 @@ class _Processes:
 
 def _run(each: Recorded, out: Path, options: Sequence[str], processes: _Processes) -> Outcome:
     results = out / each.name
-    command = [sys.executable, "-m", "graphvio", "run", str(each.recording), "--out", str(results), *options]
+    command = [*RUN, str(each.recording), "--out", str(results), *options]
     command += ["--rig", str(each.rig)] if each.rig is not None else []
     code, errors = processes.run(command)
     (out / f"{each.name}.log").write_text(errors, encoding="utf-8")

@@ -76,10 +76,19 @@ class Simulator:
         groups = len(self.rig.groups)
         self.rates_hz = tuple((rates + [rates[-1]] * groups)[:groups])
         self._trigger_offset_ms = trigger_offset_ms
-        self._prepared = PreparedWorld(scene.world, atlas if atlas is not None else standard_atlas())
+        self._atlas = atlas
         self._imu_error, self._rig_change = imu_error, rig_change
         self._rays_in = lru_cache(_KEPT_STAGES)(self._rays_of)
-        self.films = [Film(rays, _SENSITIVITIES[i % 4]) for i, rays in enumerate(self._rays_in(0))]
+
+    @cached_property
+    def _prepared(self) -> PreparedWorld:
+        """The world as the renderer's kernels read it; it takes a second, for which only who renders waits."""
+        return PreparedWorld(self.scene.world, self._atlas if self._atlas is not None else standard_atlas())
+
+    @cached_property
+    def films(self) -> list[Film]:
+        """The sensors of the cameras."""
+        return [Film(rays, _SENSITIVITIES[i % 4]) for i, rays in enumerate(self._rays_in(0))]
 
     @cached_property
     def stamps_ns(self) -> Int:
