@@ -110,7 +110,7 @@ def simulate(
         raise typer.BadParameter("--calibration-component and --calibration-seed need --calibration-error LEVEL")
     true_rig = None
     if rig is not None:
-        true_rig = rig_of(rig).without_stamp_offsets()  # stamps of simulated images are instants
+        true_rig = rig_of(rig)
         _check_names(true_rig, rig)
     message = f"interrupted; {out} has only a part of the images: remove it"
     with ends_at_interrupt(message), framesets_bar() as bar:

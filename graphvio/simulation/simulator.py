@@ -70,7 +70,7 @@ class Simulator:
         if seed < 0:
             raise SourceError(f"the seed {seed} is negative; give 0 or more")
         self.scene = scene
-        self.rig = rig if rig is not None else NAMED_RIGS[scene.rig]()
+        self.rig = NAMED_RIGS[scene.rig]() if rig is None else rig.without_stamp_offsets()  # stamps are instants
         self.imu = self.rig.imu if self.rig.imu is not None else Imu()
         self.seed = seed
         groups = len(self.rig.groups)
