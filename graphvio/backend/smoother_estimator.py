@@ -244,9 +244,12 @@ class SmootherEstimator:
         first = first_state_at(stamp_ns, np.zeros(3), imu, self._rig, self._config.initialisation)
         self._final += [(ns, pose) for ns, pose in self._running.all_poses() if ns < stamp_ns]
         self._smoother = Smoother(self._config.smoother, self._rig.imu)
-        self._initialise_at(with_late_imu(first, motion, state, self.covariance))
-        self.covariance = self._running.state_covariance()
         self._report(stamp_ns, EventKind.IMU_CAME, "it is used from now on, and the path goes on")
+        try:
+            self._initialise_at(with_late_imu(first, motion, state, self.covariance))
+            self.covariance = self._running.state_covariance()
+        except SOLVER_ERRORS as error:
+            self._rebuild(stamp_ns, state, error)
 
     # ------------------------------------------------------------------ measurement update
 

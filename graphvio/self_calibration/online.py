@@ -95,7 +95,7 @@ class SelfCalibration:
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
         self._implausible: list[Gaussian] = []  # calibrations by the same, by which the file is more wrong than any
-        self._is_beyond_any = False  # the file is more wrong than any, as two full windows agree
+        self._are_cameras_beyond_any = False  # in the file, as two full windows agree
         self._sigma_px = FIRST_WINDOW_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
@@ -218,7 +218,7 @@ class SelfCalibration:
 
         None while there is but one such window, and once two have agreed, as the calibration is corrected then.
         """
-        if self._is_beyond_any or len(self._implausible) < _MIN_CONFIRMING:
+        if len(self._implausible) < _MIN_CONFIRMING:
             return None
         mean = self._implausible[-1].mean
         excess = np.divide(np.abs(mean), self._largest, out=np.zeros_like(mean), where=self._largest > 0.0)
@@ -244,7 +244,7 @@ class SelfCalibration:
         if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
             self._refuse(adjusted.is_full)
             return False
-        if not (self._is_beyond_any or self._is_plausible(calibration, adjusted.is_full)):
+        if not self._is_plausible(calibration, adjusted.is_full):
             return False
         # What a full window has confirmed, a part of one does not refute: it may be the scene's fault.
         is_confirmed = self.has_full_window and self.estimate.is_file_exact
@@ -256,14 +256,21 @@ class SelfCalibration:
         Where it is more wrong than any file, the window is at fault, unless the full one before says the same of the
         cameras. An IMU that is so wrong is none to be calibrated.
         """
-        is_plausible = np.abs(calibration.mean) <= self._largest  # also rejects NaN
-        if is_plausible.all():
+        if not np.isfinite(calibration.mean).all():
+            return False
+        is_usual = np.abs(calibration.mean) <= self._largest
+        n = self._n_camera_parameters
+        are_cameras_plausible = bool(is_usual[:n].all()) or self._are_cameras_beyond_any
+        is_imu_plausible = bool(is_usual[n:].all())
+        if are_cameras_plausible and is_imu_plausible:
             return True
-        if is_full and np.isfinite(calibration.mean).all():
+        if is_full:
             agree = bool(self._implausible) and calibration.agrees_with(self._implausible[-1])
-            self._is_beyond_any = agree and bool(is_plausible[self._n_camera_parameters :].all())
             self._implausible.append(calibration)
-        return self._is_beyond_any
+            if agree and is_imu_plausible:
+                self._are_cameras_beyond_any, self._implausible = True, []
+                return True
+        return False
 
     def _put_in_force(self, adjusted: AdjustedWindow) -> None:
         """Use an adjustment's result from now on, and its noise for the next windows."""
