@@ -63,6 +63,23 @@ def solve_symmetric(matrix: Float, right: Float) -> Float:
 
 
 @kernel
+def inverse(matrix: Float) -> Float:
+    """Return the inverse (N, N) of a positive definite matrix; NaN where it is not positive definite."""
+    n = len(matrix)
+    lower = cholesky(matrix)
+    inverted = np.zeros((n, n))  # of lower, transposed
+    for r in range(n):
+        inverted[r, r] = 1.0 / lower[r, r]
+        for c in range(r + 1, n):
+            inverted[r, c] = -_dot(lower[c, r:c], inverted[r, r:c]) / lower[c, c]
+    out = np.empty((n, n))
+    for r in range(n):
+        for c in range(r, n):
+            out[r, c] = out[c, r] = _dot(inverted[r, c:], inverted[c, c:])
+    return out
+
+
+@kernel
 def eliminated(matrix: Float, n_kept: int) -> Float:
     """Return the Schur complement (K, K) of all but the last K unknowns of a positive definite matrix (N, N)."""
     n_left = len(matrix) - n_kept

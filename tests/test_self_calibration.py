@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from graphvio.calibration_sigmas import LEVELS
 from graphvio.cameras import MODEL_NAMES
 from graphvio.errors import RigError
 from graphvio.geometry import se3_exp, so3_exp, so3_log
-from graphvio.linear_algebra import eliminated, solve_symmetric
+from graphvio.linear_algebra import eliminated, inverse, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
@@ -23,7 +24,15 @@ from graphvio.self_calibration import solver, window_adjustment
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks
 from graphvio.self_calibration.collector import FullWindow, WindowCollector
-from graphvio.self_calibration.evidence import _FACTORS, EXACT, MAX_FACTOR, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.evidence import (
+    _FACTORS,
+    EXACT,
+    MAX_FACTOR,
+    Evidence,
+    FactorLikelihood,
+    FilePrior,
+    Gaussian,
+)
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector
@@ -158,13 +167,15 @@ def test_eliminate_landmarks_gradient_equals_that_of_the_cost_over_all_unknowns(
     assert np.linalg.eigvalsh(hessian).min() > -1e-6 * np.abs(hessian).max()
 
 
-def test_solve_symmetric_and_eliminated_agree_with_numpy() -> None:
+def test_solve_symmetric_inverse_and_eliminated_agree_with_numpy() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((40, 40))
     matrix, right = root @ root.T + np.eye(40), rng.standard_normal(40)
     assert solve_symmetric(matrix, right) == pytest.approx(np.linalg.solve(matrix, right))
     expected = matrix[30:, 30:] - matrix[30:, :30] @ np.linalg.solve(matrix[:30, :30], matrix[:30, 30:])
     assert eliminated(matrix, 10) == pytest.approx(expected)
+    assert inverse(matrix) == pytest.approx(np.linalg.inv(matrix), abs=1e-12)
+    assert np.isnan(inverse(-matrix)).all()
 
 
 # ---------------------------------------------------------------- how wrong the file is
@@ -228,6 +239,26 @@ def test_mean_square_of_what_nothing_shows_is_not_that_of_an_exact_file() -> Non
     found = Evidence(np.diag([1e8, 0.0]), np.zeros(2)).mean_square(prior, np.zeros(2))
     assert found[0, 0] < 1e-7
     assert 1.0 < found[1, 1] / prior.covariance[1, 1] < MAX_FACTOR**2
+
+
+def test_mean_square_is_that_over_all_factors_though_few_are_evaluated() -> None:
+    prior = FilePrior(np.diag([1.0, 4.0, 0.25, 1.0, 2.0, 0.5]), np.repeat([0, 1], 3))
+    grid, ratios = [np.array(each) for each in product(_FACTORS, repeat=2)], []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        rows = rng.standard_normal((rng.integers(1, 8), 6)) * 10.0 ** rng.uniform(-1.0, 3.0)
+        x = prior.of_each(rng.choice(_FACTORS, 2)) * np.sqrt(np.diag(prior.covariance)) * rng.standard_normal(6)
+        evidence = Evidence(rows.T @ rows, rows.T @ (rows @ x + rng.standard_normal(len(rows))))
+        likelihood = FactorLikelihood(evidence, prior)
+        twice_log = np.array([likelihood(each) for each in grid])
+        weights, expected = np.exp(0.5 * (twice_log - twice_log.max())), np.zeros((6, 6))
+        for weight, each in zip(weights / weights.sum(), grid, strict=True):
+            posterior = evidence.given(prior, each)
+            expected += weight * (posterior.covariance + np.outer(posterior.mean, posterior.mean))
+        ratios.append(np.sqrt(np.diag(evidence.mean_square(prior, np.zeros(6))) / np.diag(expected)))
+    assert np.max(ratios) < 1.0 + 1e-4
+    assert np.percentile(ratios, 1) > 0.99
+    assert np.min(ratios) > 0.5
 
 
 def test_forgotten_evidence_never_gains_and_keeps_the_mean_where_it_is_regular() -> None:

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.linear_algebra import cholesky, solve_lower
+from graphvio.linear_algebra import cholesky, inverse, solve_lower
 
 EXACT = 1e-3
 """Factor on the file's standard deviations of a file that is as good as exact."""
 _SWEEPS = 3
-_MIN_WEIGHT = 1e-3  # of factors that count in a mean over all of them
+_MIN_WEIGHT = 1e-5  # over the likeliest factors', of those that count in a mean over all
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 MAX_FACTOR = _FACTORS[-1]
@@ -163,18 +163,15 @@ class Evidence(NamedTuple):
             numpy.linalg.LinAlgError: if the measurements have no likelihood with any factors.
         """
         likelihood = likelihood or FactorLikelihood(self, prior)
-        factors = [np.array(each) for each in product(_FACTORS, repeat=prior.n_groups)]
+        factors = _factors_that_count(likelihood, prior.n_groups)
         twice_log = np.array([likelihood(each) for each in factors])
-        if not np.isfinite(twice_log).any():
-            raise np.linalg.LinAlgError("the measurements fit no calibration")
         weights = np.exp(0.5 * (twice_log - twice_log.max()))
-        weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
         weights /= weights.sum()
         mean_square = np.zeros_like(self.information)
-        for k in np.flatnonzero(weights):
-            posterior = self.given(prior, factors[k])
-            off = posterior.mean - in_force
-            mean_square += weights[k] * (posterior.covariance + np.outer(off, off))
+        for weight, each in zip(weights, factors, strict=True):
+            covariance = inverse(self.information + likelihood.prior_information(each))
+            off = covariance @ self.vector - in_force
+            mean_square += weight * (covariance + np.outer(off, off))
         return mean_square
 
 
@@ -198,15 +195,18 @@ class FactorLikelihood:
             self._known[key] = self._computed(factors)
         return self._known[key]
 
+    def prior_information(self, factors: Float) -> Float:
+        """Return the inverse (C, C) of the prior's covariance for factors (G,)."""
+        if self._prior.change is not None:
+            return inverse(self._prior.with_factors(factors))
+        each = self._prior.of_each(factors)
+        return np.asarray(self._information / (each * each[:, None]))
+
     def _computed(self, factors: Float) -> float:
         prior, evidence = self._prior, self._evidence
-        factor_of_each = prior.of_each(factors)
-        prior_information: Float = self._information / (factor_of_each * factor_of_each[:, None])
-        scales = factor_of_each  # their product is the root of the prior's determinant, up to a constant
-        if prior.change is not None:
-            covariance = prior.with_factors(factors)
-            prior_information, scales = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
-        lower = cholesky(evidence.information + prior_information)
+        # Their product is the root of the prior's determinant, up to a constant.
+        scales = prior.of_each(factors) if prior.change is None else np.diag(cholesky(prior.with_factors(factors)))
+        lower = cholesky(evidence.information + self.prior_information(factors))
         fitted = solve_lower(lower, evidence.vector.reshape(1, -1))[0]
         likelihood = float(fitted @ fitted - 2.0 * np.log(scales * np.diag(lower)).sum())
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite
@@ -229,3 +229,27 @@ def _ascended(likelihood: FactorLikelihood, order: Sequence[int], min_twice_log_
         if np.array_equal(factors, before):
             break
     return factors
+
+
+def _factors_that_count(likelihood: FactorLikelihood, n_groups: int) -> list[Float]:
+    """Return the factors (G,) whose likelihood is not negligible, found from the maxima outwards.
+
+    Raises:
+        numpy.linalg.LinAlgError: if no factors have a likelihood.
+    """
+    groups = list(range(n_groups))
+    maxima = [_ascended(likelihood, groups[first:] + groups[:first], np.zeros(n_groups)) for first in groups]
+    known = {tuple(np.searchsorted(_FACTORS, each)): likelihood(each) for each in maxima}
+    outward = list(known)
+    while outward:
+        at = outward.pop()
+        if known[at] > max(known.values()) + 2.0 * np.log(_MIN_WEIGHT):
+            for step in product((-1, 0, 1), repeat=n_groups):
+                neighbour = tuple(np.add(at, step))
+                if neighbour not in known and all(0 <= k < len(_FACTORS) for k in neighbour):
+                    known[neighbour] = likelihood(np.take(_FACTORS, neighbour))
+                    outward.append(neighbour)
+    likeliest = max(known.values())
+    if not np.isfinite(likeliest):
+        raise np.linalg.LinAlgError("the measurements fit no calibration")
+    return [np.take(_FACTORS, at) for at, each in known.items() if each > likeliest + 2.0 * np.log(_MIN_WEIGHT)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
+from graphvio.linear_algebra import cholesky, inverse, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
@@ -29,3 +29,4 @@ def warm_up_adjustment(rig: Rig) -> None:
     information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
     solve_lower(cholesky(information), right)
     solve_rows(information, right)
+    inverse(information)
