@@ -16,11 +16,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.calibration.alignment import alignment_errors_of, squared_lengths_of
 from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs, inverses
 from graphvio.errors import CalibrationError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, so3_exp
-from graphvio.kernels import kernel
-from graphvio.linear_algebra import squared_length
 
 _TRIPLES = 500
 _CANDIDATES = 10  # best triples, which are refined before one is chosen
@@ -140,25 +139,12 @@ def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
     Each is the vector between the centres of the second camera at the end of a motion, as both cameras' motions predict
     it, in the frame of the first camera at the beginning; ``t = -R^T T`` is that centre in the first camera's frame.
     """
-    return _alignment_errors(parts.R_1, parts.T_1, _moved(parts), np.ascontiguousarray(R), t)
+    return alignment_errors_of(parts.R_1, parts.T_1, _moved(parts), np.ascontiguousarray(R), t)
 
 
 def _moved(parts: PoseParts) -> Float:
     """Return ``R_2^T T_2`` (N, 3)."""
     return np.asarray(np.einsum("nji,nj->ni", parts.R_2, parts.T_2))
-
-
-@kernel
-def _alignment_errors(R_1: Float, T_1: Float, moved: Float, R: Float, t: Float) -> Float:
-    """Compute `alignment_errors` (N, 3) from ``R_2^T T_2`` (N, 3)."""
-    errors = np.empty((len(R_1), 3))
-    for n in range(len(R_1)):
-        for i in range(3):
-            total = -t[i]
-            for k in range(3):
-                total += R[k, i] * moved[n, k] + R_1[n, k, i] * (t[k] - T_1[n, k])
-            errors[n, i] = total
-    return errors
 
 
 def jacobians(parts: PoseParts, R: Float) -> Float:
@@ -232,52 +218,12 @@ class _Weighted:
 
     def distances(self, R: Float, t: Float) -> Float:
         """Squared Mahalanobis distances (N,) of the alignment errors from zero."""
-        errors = _alignment_errors(self.parts.R_1, self.parts.T_1, self._moved, R, t)
-        return _squared_lengths(errors, self.parts.R_1, self._covariance_1, self._covariance_2, R, t)
+        errors = alignment_errors_of(self.parts.R_1, self.parts.T_1, self._moved, R, t)
+        return squared_lengths_of(errors, self.parts.R_1, self._covariance_1, self._covariance_2, R, t)
 
     def costs(self, R: Float, t: Float, limit: float) -> Float:
         """Sum the `distances`, each up to a limit: (M,) for M solutions."""
         return np.array([np.minimum(self.distances(*each), limit).sum() for each in zip(R, t, strict=True)])
-
-
-@kernel
-def _squared_lengths(
-    errors: Float, R_1: Float, covariance_1: Float, covariance_2: Float, R: Float, t: Float
-) -> Float:
-    """Compute squared Mahalanobis distances (N,) of alignment errors (N, 3) from zero.
-
-    Args:
-        errors: (N, 3).
-        R_1: (N, 3, 3).
-        covariance_1: (N, 6, 6) of the first camera's motions, tangent at their end.
-        covariance_2: (N, 3, 3) of the second camera's positions at the end, in its frame at the beginning.
-        R: (3, 3).
-        t: (3,).
-    """
-    found = np.empty(len(errors))
-    turned, by_1, covariance = np.empty((3, 6)), np.empty((3, 6)), np.empty((3, 3))
-    for n in range(len(errors)):
-        for i in range(3):  # R_1^T [-[t]_x, I]
-            a, b, c = R_1[n, 0, i], R_1[n, 1, i], R_1[n, 2, i]
-            by_1[i, 0], by_1[i, 1], by_1[i, 2] = c * t[1] - b * t[2], a * t[2] - c * t[0], b * t[0] - a * t[1]
-            by_1[i, 3], by_1[i, 4], by_1[i, 5] = a, b, c
-        for i in range(3):
-            for k in range(6):
-                total = 0.0
-                for m in range(6):
-                    total += by_1[i, m] * covariance_1[n, m, k]
-                turned[i, k] = total
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for k in range(6):
-                    total += turned[i, k] * by_1[j, k]
-                for k in range(3):
-                    for m in range(3):
-                        total += R[k, i] * covariance_2[n, k, m] * R[m, j]
-                covariance[i, j] = total
-        found[n] = squared_length(errors[n], covariance)
-    return found
 
 
 def _best_triples(weighted: _Weighted, rng: np.random.Generator) -> list[tuple[Float, Float]]:
