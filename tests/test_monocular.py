@@ -711,7 +711,7 @@ def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_
     trusting = replace(Config(), calibration=CalibrationConfig(online=False))
     for seed in range(2):
         true_difference, written = wrong_by(rig, seed)
-        flown = fly(moving(), 6.5, fewer, rig=rig, believed=written, seed=5 + seed)
+        flown = fly(moving(), 8.0, fewer, rig=rig, believed=written, seed=5 + seed)
         estimate = flown.estimator.calibration
         assert estimate is not None
         assert not estimate.is_file_exact
@@ -720,7 +720,7 @@ def test_calibration_of_a_wrong_file_is_found_within_its_covariance_and_that_of_
         errors.append(off[known])
         late = flown.stamps_s > 3.0
         ours, _ = aligned(flown._replace(poses=flown.poses[late], truth=flown.truth[late]))
-        trusted = fly(moving(), 6.5, fewer, rig=rig, believed=written, seed=5 + seed, config=trusting)
+        trusted = fly(moving(), 8.0, fewer, rig=rig, believed=written, seed=5 + seed, config=trusting)
         late = trusted.stamps_s > 3.0
         theirs, _ = aligned(trusted._replace(poses=trusted.poses[late], truth=trusted.truth[late]))
         assert ours < 0.7 * theirs
