@@ -52,8 +52,8 @@ def _ran(call: Callable[[], object], typed: list[str], folder: Path) -> Ran:
     return Ran(code, out.getvalue(), err.getvalue())
 
 
-def graphvio_alone(*arguments: object, folder: Path = Path()) -> Ran:
-    """Run a command in a folder, in a process of its own."""
-    command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
+def python_alone(file: Path, *arguments: object, folder: Path = Path()) -> Ran:
+    """Run a program of Python in a folder, in a process of its own."""
+    command = [sys.executable, str(file), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=_SOON_S, check=False)
     return Ran(done.returncode, done.stdout, done.stderr)

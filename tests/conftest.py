@@ -29,13 +29,13 @@ _LONGEST = (
     "keyframes", "ros2_source", "cli_live", "fleet_s3", "json_output", "fleet", "cli_serve", "kernels",
     "start_in_motion", "calibration_trajectories", "simulation_scenes", "backend_smoother", "convert",
     "calibration_start", "backend_shared_error", "benchmark", "calibration_methods", "calibration_several",
-    "frontend_lucas_kanade", "slam_single_cameras", "calibration_pair", "slam_fuzz", "calibration_memory",
+    "slam_single_cameras", "calibration_pair", "slam_fuzz", "calibration_memory",
     "sessions", "single_cameras", "nav_frame", "overlaps", "site", "docs", "image_masks", "cli_warming",
     "simulation_calibration_error", "sources", "live_oak", "image_noise", "ros2_package", "colmap_export",
     "real_imu", "cli_calibrate_trajectories", "ros2_publisher", "ekf_estimator", "simulation_rendering",
     "linear_algebra", "simulation_recording", "rig_files", "ekf_graph", "calibration_curves", "clock_map",
-    "plotting", "simulation_named_rigs", "time_offset", "turning_on_the_spot", "frontend_tracker", "map_frame",
-    "trajectory_formats", "simulation_motion", "frontend_slanted", "optimization_report", "cli_program",
+    "plotting", "simulation_named_rigs", "time_offset", "turning_on_the_spot", "map_frame",
+    "trajectory_formats", "simulation_motion", "optimization_report", "cli_program",
     "self_calibration_singles", "live_sources", "stamp_jitter", "calibration_imu", "ros2_discovery", "interrupts",
 )  # fmt: skip
 _RANKS = {f"test_{name}": rank for rank, name in enumerate(_LONGEST)}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from command_line import graphvio
 from dataset_layouts import rendered_walk, true_poses
-from recordings import REAL_DATA
+from real_clip import CLIP, real_clip
 
 from graphvio.benchmark.datasets import DATASETS, dataset_of, find_sequences
 from graphvio.benchmark.run import evaluate_with
@@ -117,9 +117,9 @@ def test_benchmark_writes_table_document_and_report_where_one_sequence_fails(tmp
 
 
 @pytest.mark.usefixtures("without_plots")
-@pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").is_dir(), reason="the clip of EuRoC is not there")
+@pytest.mark.skipif(not CLIP.is_dir(), reason="the clip of EuRoC is not there")
 def test_benchmark_of_the_clip_stands_beside_published_figures(tmp_path: Path) -> None:
-    ran = graphvio("benchmark", "euroc", REAL_DATA / "euroc_mh01_clip", "--out", tmp_path / "out", "--to", 2)
+    ran = graphvio("benchmark", "euroc", real_clip(), "--out", tmp_path / "out", "--to", 2)
     assert ran.returncode == 0, ran.stderr
     row = next(line for line in ran.stdout.splitlines() if re.match(r"\W MH_01 ", line))
     cells = [cell.strip() for cell in re.split("[|│]", row)[1:-1]]

@@ -12,11 +12,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from browser import free_options
-from command_line import graphvio
+from command_line import Ran, graphvio
 from ros2_loopback import URI, free_domain
 
 from graphvio import load_trajectory, open_source
@@ -27,10 +28,10 @@ pytest.importorskip("cyclonedds")
 SOON_S = 200.0
 
 
-def slam(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from graphvio.cli import main; main()", "slam", *map(str, arguments)]
-    env = {**os.environ, "CYCLONEDDS_URI": URI}
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=SOON_S, env=env)
+def slam(*arguments: object) -> Ran:
+    """Run the odometry in this process, and the SLAM in one of its own."""
+    with patch.dict(os.environ, {"CYCLONEDDS_URI": URI}):
+        return graphvio("slam", *arguments)
 
 
 @pytest.fixture(scope="module")

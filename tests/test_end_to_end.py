@@ -6,13 +6,15 @@ import re
 import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from command_line import Ran, graphvio, graphvio_alone
+import undrawn_run
+from command_line import Ran, graphvio, python_alone
 from real_clip import CLIP, real_clip
 from undrawn import undrawn
 
@@ -95,7 +97,7 @@ def assert_gravity_and_gyro_bias_are_found(out: Path) -> None:
 
 def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path) -> None:
     summary = run(room_walk, tmp_path / "a", plots=True)
-    run(room_walk, tmp_path / "b", command=graphvio_alone)
+    run(room_walk, tmp_path / "b", command=partial(python_alone, Path(undrawn_run.__file__)))
     for name in ("trajectory.txt", "pairs.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
     names = {path.name for path in (tmp_path / "a").iterdir()}

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import undrawn_run
 from calibration_walks import recorded
 from command_line import python
 
@@ -184,7 +185,8 @@ def installed(tmp_path: Path) -> Path:
 def test_custom_source(room_walk: Path, installed: Path, tmp_path: Path) -> None:
     _run_alone("write_npz", room_walk, "room-npz", folder=tmp_path, search=EXAMPLES / "custom_source")
     assert len(list((tmp_path / "room-npz/frames").glob("*.npz"))) == 100
-    _run_alone("graphvio", "run", "room-npz", "--out", "results", "--to", "2", folder=tmp_path, search=installed)
+    shutil.copy(undrawn_run.__file__, installed)
+    _run_alone("undrawn_run", "run", "room-npz", "--out", "results", "--to", "2", folder=tmp_path, search=installed)
     poses = load_trajectory(tmp_path / "results/trajectory.txt")
     truth = open_source(room_walk)
     assert len(poses) == 41

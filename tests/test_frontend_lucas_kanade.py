@@ -17,11 +17,10 @@ LEVELS = 4
 def texture(shift: tuple[float, float] = (0.0, 0.0), seed: int = 0) -> Image:
     """Smooth random texture whose content is moved by (x, y) pixels, exactly: a sum of waves."""
     rng = np.random.default_rng(seed)
-    y, x = np.mgrid[:240, :320].astype(np.float64)
-    image = np.zeros_like(x)
-    for _ in range(80):
-        kx, ky = rng.normal(0.0, 0.25, 2)
-        image += np.cos(kx * (x - shift[0]) + ky * (y - shift[1]) + rng.uniform(0.0, 2.0 * np.pi))
+    kx, ky, phase = np.array([[*rng.normal(0.0, 0.25, 2), rng.uniform(0.0, 2.0 * np.pi)] for _ in range(80)]).T
+    along_x, along_y = np.outer(kx, np.arange(320.0) - shift[0]), np.outer(ky, np.arange(240.0) - shift[1])
+    along_y += phase[:, None]
+    image = np.cos(along_y).T @ np.cos(along_x) - np.sin(along_y).T @ np.sin(along_x)  # the cosines of their sums
     return np.asarray(np.clip(np.round(128.0 + 12.0 * image), 0, 255), dtype=np.uint8)
 
 
@@ -133,9 +132,9 @@ def test_track_into_another_scene_fails_the_way_back() -> None:
 # ------------------------------------------------------------------ deformed patches
 
 
-def warped(warp: Float, middle: Float, place: Float) -> Image:
+def warped(warp: Float, middle: Float, place: Float, size: tuple[int, int] = (240, 320)) -> Image:
     """`waves` as a camera sees it whose pixel ``q`` shows what is at ``middle + warp (q - place)`` elsewhere."""
-    y, x = np.mgrid[:240, :320].astype(np.float64)
+    y, x = np.mgrid[: size[0], : size[1]].astype(np.float64)
     u, v = x - place[0], y - place[1]
     return picture(waves(middle[0] + warp[0, 0] * u + warp[0, 1] * v, middle[1] + warp[1, 0] * u + warp[1, 1] * v))
 
@@ -147,13 +146,13 @@ def rotation(angle_rad: float) -> Float:
 WARPS = [np.eye(2), rotation(0.5), 1.4 * np.eye(2), 0.75 * rotation(-0.3), np.array([[1.0, 0.4], [0.0, 1.0]])]
 
 
-PLACE = np.array([160.7, 120.4])
+PLACE = np.array([40.7, 40.4])
 
 
 @cache
 def deformed(number: int) -> list[tuple[Float, Image]]:
     """Middles (2,) of patches, and the images that a warp makes of them, each with its middle at the same place."""
-    return [(middle, warped(WARPS[number], middle, PLACE)) for middle in grid()[::7]]
+    return [(middle, warped(WARPS[number], middle, PLACE, (80, 80))) for middle in grid()[::7]]
 
 
 def registered(number: int, assumed: Float, guess_error: Float) -> tuple[Float, Bool]:

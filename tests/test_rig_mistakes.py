@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,7 @@ def test_inverted_transforms_are_named(walked: tuple[Rig, list[FrameSet]]) -> No
     assert "exchanged" not in warning
 
 
+@cache
 def waves(shift_px: float) -> Image:
     """An image of vertical waves, which match at any multiple of their length, with some rows."""
     x, y = np.meshgrid(np.arange(320.0) + shift_px, np.arange(240.0))

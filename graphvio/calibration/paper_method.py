@@ -16,9 +16,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.calibration.alignment import alignment_errors_of, squared_lengths_of
 from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs, inverses
 from graphvio.errors import CalibrationError
-from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, skew, so3_exp
+from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, so3_exp
 
 _TRIPLES = 500
 _CANDIDATES = 10  # best triples, which are refined before one is chosen
@@ -44,8 +45,10 @@ class PoseParts(NamedTuple):
     @staticmethod
     def of(pairs: PosePairs) -> PoseParts:
         """Return the parts of N pose pairs."""
-        P_1, P_2 = inverses(pairs.motion_1), inverses(pairs.motion_2)
-        return PoseParts(P_1[:, :3, :3], P_1[:, :3, 3], P_2[:, :3, :3], P_2[:, :3, 3])
+        parts = []
+        for P in (inverses(pairs.motion_1), inverses(pairs.motion_2)):
+            parts += [np.ascontiguousarray(P[:, :3, :3]), np.ascontiguousarray(P[:, :3, 3])]
+        return PoseParts(*parts)
 
     def select(self, rows: Bool | Int) -> PoseParts:
         """Return some of them, by mask or indices."""
@@ -136,9 +139,12 @@ def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
     Each is the vector between the centres of the second camera at the end of a motion, as both cameras' motions predict
     it, in the frame of the first camera at the beginning; ``t = -R^T T`` is that centre in the first camera's frame.
     """
-    by_2 = np.einsum("ji,nkj,nk->ni", R, parts.R_2, parts.T_2)  # R^T R_2^T T_2
-    by_1 = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)  # R_1^T (t - T_1)
-    return np.asarray(by_2 + by_1 - t)
+    return alignment_errors_of(parts.R_1, parts.T_1, _moved(parts), np.ascontiguousarray(R), t)
+
+
+def _moved(parts: PoseParts) -> Float:
+    """Return ``R_2^T T_2`` (N, 3)."""
+    return np.asarray(np.einsum("nji,nj->ni", parts.R_2, parts.T_2))
 
 
 def jacobians(parts: PoseParts, R: Float) -> Float:
@@ -156,7 +162,7 @@ def _by_turn(R: Float, crosses: Float) -> Float:
 
 def _moved_crosses(parts: PoseParts) -> Float:
     """Return the matrices (N, 3, 3) of the cross products with ``R_2^T T_2``."""
-    return _crosses(np.einsum("nji,nj->ni", parts.R_2, parts.T_2))  # [R_2^T T_2]_x
+    return _crosses(_moved(parts))  # [R_2^T T_2]_x
 
 
 def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tuple[Float, Float]:
@@ -206,16 +212,14 @@ class _Weighted:
         self.turns = np.linalg.norm(pairs.rotations_rad, axis=1)
         variances = [np.trace(each[:, :3, :3], axis1=1, axis2=2) for each in (pairs.covariance_1, pairs.covariance_2)]
         self.noise_rad = float(np.sqrt(np.median(variances) / 3.0))
-        self._R_1, self._covariance_1 = pairs.motion_1[:, :3, :3], pairs.covariance_1
+        self._moved, self._covariance_1 = _moved(self.parts), np.ascontiguousarray(pairs.covariance_1)
         R_2 = pairs.motion_2[:, :3, :3]
         self._covariance_2 = R_2 @ pairs.covariance_2[:, 3:, 3:] @ np.swapaxes(R_2, 1, 2)
 
     def distances(self, R: Float, t: Float) -> Float:
         """Squared Mahalanobis distances (N,) of the alignment errors from zero."""
-        errors = alignment_errors(self.parts, R, t)
-        by_1 = self._R_1 @ np.hstack([-skew(t), np.eye(3)])
-        covariances = by_1 @ self._covariance_1 @ np.swapaxes(by_1, 1, 2) + R.T @ self._covariance_2 @ R
-        return np.asarray(np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]))
+        errors = alignment_errors_of(self.parts.R_1, self.parts.T_1, self._moved, R, t)
+        return squared_lengths_of(errors, self.parts.R_1, self._covariance_1, self._covariance_2, R, t)
 
     def costs(self, R: Float, t: Float, limit: float) -> Float:
         """Sum the `distances`, each up to a limit: (M,) for M solutions."""

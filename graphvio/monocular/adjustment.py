@@ -11,7 +11,16 @@ from graphvio.linear_algebra import cholesky, product, solve_lower, solve_rows, 
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.reprojection import Cameras
-from graphvio.monocular.states import BIASES, GRAVITY, Prior, States, columns_of, inertial_columns, visual_columns
+from graphvio.monocular.states import (
+    BIASES,
+    GRAVITY,
+    Prior,
+    States,
+    add_block,
+    columns_of,
+    inertial_columns,
+    visual_columns,
+)
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
 from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
@@ -94,9 +103,9 @@ def equations(
     known = 9 * n + GRAVITY + BIASES
     hessian, gradient = np.zeros((known + n_free, known + n_free)), np.zeros(known + n_free)
     of_imu, of_views = inertial_columns(n, n_camera_parameters, n_free), visual_columns(n, n_camera_parameters, n_free)
-    hessian[np.ix_(of_imu, of_imu)] = inertial.hessian[: len(of_imu), : len(of_imu)]
+    add_block(hessian, of_imu, inertial.hessian)
     gradient[of_imu] = inertial.gradient[: len(of_imu)]
-    hessian[np.ix_(of_views, of_views)] += visual_hessian
+    add_block(hessian, of_views, visual_hessian)
     gradient[of_views] += visual_gradient
     cost += inertial.cost
     for k in measured.stationary:
@@ -116,7 +125,7 @@ def equations(
         columns = columns_of(n, np.arange(m), n_free)
         pull = times(prior.information, off)
         size = len(columns)
-        hessian[np.ix_(columns, columns)] += prior.information[:size, :size]
+        add_block(hessian, columns, prior.information)
         gradient[columns] += (prior.gradient + pull)[:size]
         cost += float((prior.gradient * off + 0.5 * off * pull).sum())
     if file is not None:
@@ -146,8 +155,9 @@ def adjust(
     at = equations(measured, states, landmarks, prior, file)
     damping = 1e-8
     for _ in range(max_steps):
-        diagonal = np.diag(np.diag(at.hessian))
-        step = -solve_symmetric(at.hessian + damping * diagonal, at.gradient)
+        damped, diagonal = at.hessian.copy(), np.diag(at.hessian)
+        np.fill_diagonal(damped, diagonal + damping * diagonal)
+        step = -solve_symmetric(damped, at.gradient)
         if not np.isfinite(step).all():
             raise np.linalg.LinAlgError("the window's solution is not finite")
         moved = states.moved(step)

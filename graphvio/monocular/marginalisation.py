@@ -9,7 +9,16 @@ from graphvio.linear_algebra import product, solve_rows
 from graphvio.measurements.window_views import FirstWindow
 from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements, times
 from graphvio.monocular.equations import visual_equations
-from graphvio.monocular.states import BIASES, GRAVITY, Prior, States, columns_of, inertial_columns, visual_columns
+from graphvio.monocular.states import (
+    BIASES,
+    GRAVITY,
+    Prior,
+    States,
+    add_block,
+    columns_of,
+    inertial_columns,
+    visual_columns,
+)
 from graphvio.monocular.structure import Eliminated
 from graphvio.self_calibration.inertial import InertialStates, inertial_equations
 
@@ -40,7 +49,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
     size = 9 * n + GRAVITY + BIASES + n_free
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     of_views = visual_columns(n, n_camera_parameters, n_free)
-    hessian[np.ix_(of_views, of_views)] += visual_hessian
+    add_block(hessian, of_views, visual_hessian)
     gradient[of_views] += visual_gradient
     if n > 1:
         two = states.of(np.arange(2))
@@ -48,9 +57,8 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         inertial = inertial_equations(first, InertialStates(two.poses, two.velocities, two.gravity, two.parameters))
         of_two = columns_of(n, np.arange(2), n_free)
         columns = of_two[inertial_columns(2, n_camera_parameters, n_free)]
-        known = len(columns)
-        hessian[np.ix_(columns, columns)] += inertial.hessian[:known, :known]
-        gradient[columns] += inertial.gradient[:known]
+        add_block(hessian, columns, inertial.hessian)
+        gradient[columns] += inertial.gradient[: len(columns)]
     if 0 in measured.stationary:
         at = 6 * n + np.arange(3)
         hessian[at, at] += 1.0 / ZERO_VELOCITY_SIGMA**2
@@ -59,7 +67,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         m = len(prior.at.poses)
         off = states.of(np.arange(m)).since(prior.at)
         columns = columns_of(n, np.arange(m), n_free)
-        hessian[np.ix_(columns, columns)] += prior.information
+        add_block(hessian, columns, prior.information)
         gradient[columns] += prior.gradient + times(prior.information, off)
     leaving, kept = columns_of(n, np.arange(1))[:9], columns_of(n, np.arange(1, n), n_free)
     gain = solve_rows(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(kept, leaving)])

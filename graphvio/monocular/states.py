@@ -15,6 +15,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp, so3_log
+from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import Cameras
 from graphvio.self_calibration.imu_model import PARAMETERS
 
@@ -131,6 +132,14 @@ def visual_columns(n: int, n_camera_parameters: int, n_free: int) -> Int:
     """Return where the unknowns of `visual_equations` are: poses, and cameras unless the calibration is known."""
     known = 9 * n + GRAVITY + BIASES
     return np.concatenate([np.arange(6 * n), known + np.arange(n_camera_parameters if n_free else 0)])
+
+
+@kernel
+def add_block(hessian: Float, columns: Int, block: Float) -> None:
+    """Add to the rows and columns (M,) of a Hessian (N, N) the first M of a block's (M at least, M at least)."""
+    for r in range(len(columns)):
+        for c in range(len(columns)):
+            hessian[columns[r], columns[c]] += block[r, c]
 
 
 def size_m(positions: Float) -> float:

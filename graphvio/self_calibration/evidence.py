@@ -87,7 +87,9 @@ class FilePrior(NamedTuple):
 
     def of_each(self, factors: Float) -> Float:
         """Return each parameter's factor (C,), of the groups' factors (G,)."""
-        return np.asarray(np.append(factors, 1.0)[self.group])  # group -1, without a factor, selects the appended 1.0
+        padded = np.ones(len(factors) + 1)
+        padded[:-1] = factors
+        return np.asarray(padded[self.group])  # group -1, without a factor, selects the last 1.0
 
 
 class Evidence(NamedTuple):
@@ -239,17 +241,18 @@ def _factors_that_count(likelihood: FactorLikelihood, n_groups: int) -> list[Flo
     """
     groups = list(range(n_groups))
     maxima = [_ascended(likelihood, groups[first:] + groups[:first], np.zeros(n_groups)) for first in groups]
-    known = {tuple(np.searchsorted(_FACTORS, each)): likelihood(each) for each in maxima}
-    outward = list(known)
+    every, margin = np.array(_FACTORS), 2.0 * np.log(_MIN_WEIGHT)
+    known = {tuple(np.searchsorted(every, each).tolist()): likelihood(each) for each in maxima}
+    outward, likeliest = list(known), max(known.values())
     while outward:
         at = outward.pop()
-        if known[at] > max(known.values()) + 2.0 * np.log(_MIN_WEIGHT):
-            for step in product((-1, 0, 1), repeat=n_groups):
-                neighbour = tuple(np.add(at, step))
-                if neighbour not in known and all(0 <= k < len(_FACTORS) for k in neighbour):
-                    known[neighbour] = likelihood(np.take(_FACTORS, neighbour))
+        if known[at] > likeliest + margin:
+            # neighbours by one step of any of the factors
+            for neighbour in product(*(range(max(k - 1, 0), min(k + 2, len(every))) for k in at)):
+                if neighbour not in known:
+                    known[neighbour] = likelihood(every[list(neighbour)])
+                    likeliest = max(likeliest, known[neighbour])
                     outward.append(neighbour)
-    likeliest = max(known.values())
     if not np.isfinite(likeliest):
         raise np.linalg.LinAlgError("the measurements fit no calibration")
-    return [np.take(_FACTORS, at) for at, each in known.items() if each > likeliest + 2.0 * np.log(_MIN_WEIGHT)]
+    return [every[list(at)] for at, each in known.items() if each > likeliest + margin]
