@@ -547,6 +547,19 @@ def test_an_estimated_rig_file_is_as_wrong_as_it_says_however_well_it_fits() -> 
     np.testing.assert_allclose(np.linalg.inv(file.information), prior.covariance, rtol=1e-6, atol=1e-18)
 
 
+def test_an_estimated_rig_file_is_taken_as_it_is_while_stamps_jitter() -> None:
+    rig = single_rig()
+    calibration = WindowCalibration(replace(rig, calibration_sigmas=replace(rig.calibration_sigmas, estimated=True)))
+    calibration.are_stamps_exact = False
+    (factors,) = calibration.candidates
+    assert calibration.file(factors) is None
+    calibration.begin(factors)
+    assert calibration.is_file_exact
+    calibration.are_stamps_exact = True
+    calibration.update(Evidence.none(calibration.size))
+    assert not calibration.is_file_exact
+
+
 @pytest.mark.parametrize(("jitter_ms", "are_exact"), [(0.0, True), (0.1, True), (1.0, False)])
 def test_nothing_is_learnt_of_the_calibration_from_stamps_that_jitter(jitter_ms: float, are_exact: bool) -> None:
     rig, rng = small_rig().without_pairs(), np.random.default_rng(1)

@@ -93,6 +93,8 @@ class WindowCalibration:
     @property
     def candidates(self) -> list[Float]:
         """Factors (G,) with which a first window is tried."""
+        if self._prior.estimated and not self.are_stamps_exact:
+            return [np.full(self._prior.n_groups, EXACT)]  # nothing is to be learnt of it: it is taken as it is
         if not (self.is_file_exact and self.size and self.are_stamps_exact):
             return [self.factors]
         return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]
