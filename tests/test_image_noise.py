@@ -9,7 +9,9 @@ from waves import picture, waves
 
 from graphvio import FrameSet, Odometry, open_source
 from graphvio.arrays import AnyArray, Image
+from graphvio.config.stages import CornerConfig
 from graphvio.evaluation import evaluate
+from graphvio.frontend.corners import find_corners
 from graphvio.frontend.image_noise import NoiseFilter, has_less_contrast, noise_sigma
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -57,6 +59,19 @@ def test_filter_smooths_both_images_while_one_is_noisy_and_leaves_clean_ones_alo
             assert np.std(right - scene) < 0.6 * np.std(image - scene)
             assert np.std(left - scene) < 0.2 * texture
     assert noise_filter.filtered(clean, None) == (clean, None)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 6.0])
+def test_smoothed_noise_shows_no_corners(sigma: float) -> None:
+    """Of a blank wall, smoothed noise looks like corners beside a deviation that is measured after the smoothing."""
+    noise_filter, config = NoiseFilter(), CornerConfig()
+    image, _ = noise_filter.filtered(noisy(np.full(X.shape, 120.0), sigma, 1), None)
+    admitted = config.noise_factor * noise_filter.left_sigma
+    everywhere, nothing = np.ones(image.shape, dtype=np.bool_), (np.zeros((0, 2)), np.zeros(0, dtype=bool))
+    assert len(find_corners(image, everywhere, *nothing, 18, config.border_px, admitted)) <= 2
+    # The deviation is that of white noise with the gradients that the image has.
+    slopes = 0.5 * (image[:, 2:].astype(float) - image[:, :-2])
+    assert noise_filter.left_sigma == pytest.approx(np.sqrt(2.0) * slopes.std(), rel=0.15)
 
 
 @pytest.mark.skipif(not CLIP.exists(), reason="the real recording is not here")

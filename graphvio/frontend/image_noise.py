@@ -21,13 +21,16 @@ _BLOCK_PX, _BLOCK_STEP = 16, 2
 _MAX_TEXTURED = 0.25  # of the blocks: corners lie in these
 _MIN_TO_SMOOTH, _MIN_TO_GO_ON = 0.2, 0.15  # noise over contrast; sharp images have less than 0.1
 _SMOOTHING_PX = 0.8
+_SMOOTHED = 0.315  # gradients of white noise after the smoothing, over those before
+_ROUNDING = float(1.0 / np.sqrt(12.0))  # to whole grey levels
 
 
 class NoiseFilter:
     """Smooths images of the cameras of one pair while their noise is large against what they show.
 
     Attributes:
-        left_sigma: standard deviation of the noise of the newest left image as it was returned, grey levels.
+        left_sigma: noise of the newest left image as it was returned: standard deviation, grey levels, of white noise
+            with the same gradients.
     """
 
     def __init__(self) -> None:
@@ -48,9 +51,8 @@ class NoiseFilter:
         )
         if not self._is_smoothing:
             return left, right
-        left = _smoothed(left)
-        self.left_sigma = noise_sigma(left)
-        return left, None if right is None else _smoothed(right)
+        self.left_sigma = float(np.hypot(_SMOOTHED * self.left_sigma, _ROUNDING))
+        return _smoothed(left), None if right is None else _smoothed(right)
 
 
 def _smoothed(image: Image) -> Image:
@@ -104,11 +106,10 @@ def noise_sigma(image: Image) -> float:
             edges = int(image[y - 1, x]) + int(image[y + 1, x]) + int(image[y, x - 1]) + int(image[y, x + 1])
             histogram[min(abs(corners - 2 * edges + 4 * middle), _MAX_RESPONSE)] += 1
             count += 1
-    rounding = float(1.0 / np.sqrt(12.0))
     below = 0
     for value in range(_MAX_RESPONSE + 1):
         if below + histogram[value] > _QUANTILE * count:
             within = (_QUANTILE * count - below) / histogram[value]
-            return float(max((value - 0.5 + within) / _GAIN, rounding))
+            return float(max((value - 0.5 + within) / _GAIN, _ROUNDING))
         below += histogram[value]
-    return rounding
+    return _ROUNDING

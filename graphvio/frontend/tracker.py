@@ -242,7 +242,8 @@ class GroupTracker:
         # What leaves the image is not looked for: next to its edge something similar would be found instead.
         others = np.flatnonzero(~found & is_in_view)
         if len(others):
-            is_near = left_T_left_prev is not None
+            # A single camera's new tracks have no depth yet: where they are near, they move by more than predicted.
+            is_near = left_T_left_prev is not None and self._matcher is not None
             pixels[others], found[others] = self._tracked(before, last.pixels[others], guess[others], is_near)
         if found.sum() < _MIN_FOUND * len(found):
             pixels, found = self._follow_again(before, last, pixels, found)
