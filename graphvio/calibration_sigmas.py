@@ -26,6 +26,8 @@ class CalibrationSigmas:
         time_offset_s: of the IMU's time offset.
         imu_scale_share: of the scale of each axis of gyro and accelerometer.
         imu_misalignment_deg: of each axis of gyro and accelerometer.
+        estimated: whether an estimation of the calibration found them. Errors are as large as they say then: the rig
+            is not taken for exact, as one whose standard deviations are those of its kind may be.
 
     Raises:
         RigError: if a value is not positive and finite.
@@ -43,11 +45,17 @@ class CalibrationSigmas:
     time_offset_s: float = 0.002
     imu_scale_share: float = 0.003
     imu_misalignment_deg: float = 0.15
+    estimated: bool = False
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for name, value in self.values.items():
             if not np.isfinite(value) or value <= 0.0:
                 raise RigError(f"calibration_sigmas: {name} is {value}; give a positive standard deviation")
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The standard deviations by name."""
+        return {name: value for name, value in vars(self).items() if name != "estimated"}
 
     def epipolar_px(self, focal_px: float) -> float:
         """Return the standard deviation by which epipolar lines are off near the middle of the image."""
@@ -56,7 +64,9 @@ class CalibrationSigmas:
 
     def scaled(self, factor: float) -> CalibrationSigmas:
         """Return all standard deviations times a factor."""
-        return CalibrationSigmas(**{name: factor * value for name, value in vars(self).items()})
+        return CalibrationSigmas(
+            **{name: factor * value for name, value in self.values.items()}, estimated=self.estimated
+        )
 
 
 FACTORY = CalibrationSigmas()

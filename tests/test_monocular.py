@@ -535,6 +535,31 @@ def test_factors_of_the_rig_file_change_only_for_clearly_likelier_ones() -> None
     assert [factor_by(sigmas) for sigmas in (3.0, 3.85, 5.0, 3.75, 3.0)] == [3.0, 3.0, 5.0, 5.0, 3.0]
 
 
+def test_an_estimated_rig_file_is_as_wrong_as_it_says_however_well_it_fits() -> None:
+    rig = single_rig()
+    assert WindowCalibration(rig).file() is None
+    calibration = WindowCalibration(replace(rig, calibration_sigmas=replace(rig.calibration_sigmas, estimated=True)))
+    prior = calibration._prior
+    information: Float = 1e4 * np.linalg.inv(prior.covariance).astype(np.float64)
+    calibration.update(Evidence(information, np.zeros(calibration.size)))
+    file = calibration.file()
+    assert file is not None
+    np.testing.assert_allclose(np.linalg.inv(file.information), prior.covariance, rtol=1e-6, atol=1e-18)
+
+
+def test_an_estimated_rig_file_is_taken_as_it_is_while_stamps_jitter() -> None:
+    rig = single_rig()
+    calibration = WindowCalibration(replace(rig, calibration_sigmas=replace(rig.calibration_sigmas, estimated=True)))
+    calibration.are_stamps_exact = False
+    (factors,) = calibration.candidates
+    assert calibration.file(factors) is None
+    calibration.begin(factors)
+    assert calibration.is_file_exact
+    calibration.are_stamps_exact = True
+    calibration.update(Evidence.none(calibration.size))
+    assert not calibration.is_file_exact
+
+
 @pytest.mark.parametrize(("jitter_ms", "are_exact"), [(0.0, True), (0.1, True), (1.0, False)])
 def test_nothing_is_learnt_of_the_calibration_from_stamps_that_jitter(jitter_ms: float, are_exact: bool) -> None:
     rig, rng = small_rig().without_pairs(), np.random.default_rng(1)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -346,6 +347,19 @@ def test_optimize_without_loops_needs_no_extra(walk: Path, tmp_path: Path, monke
     refused = command(walk, "--to", "3", "--out", tmp_path / "other")
     assert isinstance(refused.exception, MissingExtraError)
     assert "graphvio[maps]" in str(refused.exception)
+    assert not (tmp_path / "other").exists()
+
+
+def test_optimize_a_lens_that_loop_closure_does_not_know_is_refused_before_anything_is_done(
+    walk: Path, tmp_path: Path
+) -> None:
+    rig = load_rig(walk).with_cameras(
+        lambda camera: replace(camera, model="double-sphere", distortion=np.array([-0.2, 0.6]))
+    )
+    save_rig(rig, tmp_path / "rig.yaml")
+    refused = command(walk, "--to", "3", "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "other")
+    assert isinstance(refused.exception, OptimizationError)
+    assert "--no-loops" in str(refused.exception)
     assert not (tmp_path / "other").exists()
 
 

@@ -48,7 +48,7 @@ from graphvio.self_calibration.parameters import (
     has_coefficient,
     parameter_names,
 )
-from graphvio.self_calibration.prior import file_prior
+from graphvio.self_calibration.prior import file_prior, refined_sigmas
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks
 from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
@@ -244,6 +244,14 @@ def test_mean_square_of_what_nothing_shows_is_not_that_of_an_exact_file() -> Non
     assert 1.0 < found[1, 1] / prior.covariance[1, 1] < MAX_FACTOR**2
 
 
+def test_mean_square_of_what_nothing_shows_stays_that_of_an_estimated_file_though_all_the_others_are_exact() -> None:
+    """An estimation before has corrected what measurements show; of what they do not show that says nothing."""
+    estimated = FilePrior(np.eye(30), np.zeros(30, dtype=np.int64), estimated=True)
+    shown = np.diag([*np.full(29, 1e6), 0.0])
+    assert Evidence(shown, np.zeros(30)).mean_square(estimated, np.zeros(30))[29, 29] >= 1.0
+    assert Evidence(shown, np.zeros(30)).mean_square(estimated._replace(estimated=False), np.zeros(30))[29, 29] < 0.01
+
+
 def test_mean_square_is_that_over_all_factors_though_few_are_evaluated() -> None:
     prior = FilePrior(np.diag([1.0, 4.0, 0.25, 1.0, 2.0, 0.5]), np.repeat([0, 1], 3))
     grid, ratios = [np.array(each) for each in product(_FACTORS, repeat=2)], []
@@ -326,6 +334,40 @@ def test_self_calibration_errors_are_consistent_with_its_covariance() -> None:
         normalised.append(off @ found.posterior.information @ off)
     dimension = 2 * PAIR
     assert np.mean(normalised) < chi2.ppf(0.999, 8 * dimension) / 8
+
+
+def test_self_calibration_that_begins_with_what_others_found_stays_consistent_with_its_covariance() -> None:
+    normalised = []
+    for seed in range(4):
+        rig, true, _ = sampled(3, seed)
+        for run in range(3):
+            found = calibrated(SelfCalibration(rig), Walk(true, seed=10 * run + seed), 6.0).estimate
+            assert not found.is_file_exact
+            off = found.posterior.mean - true_difference(rig, true)
+            rig = found.rig
+        normalised.append(off @ found.posterior.information @ off)
+    dimension = 2 * PAIR
+    assert np.mean(normalised) < chi2.ppf(0.999, 4 * dimension) / 4
+
+
+def test_refined_sigmas_hold_what_measurements_show_only_together_however_often_they_are_the_next_file() -> None:
+    """Of baselines and the accelerometer's scale each run shows the ratios, and never the lengths."""
+    rig, shares = default_rig(), []
+    names = parameter_names(rig)
+    baselines = [names.index(f"{pair.name}.right_T_left.tx") for pair in rig.pairs]
+    scales = [names.index(f"imu.accel_matrix.{axis}{axis}") for axis in "xyz"]
+    rows = np.zeros((4, len(names)))
+    rows[:, baselines[0]] = 1.0 / rig.pairs[0].baseline_m
+    rows[0, baselines[1]] = -1.0 / rig.pairs[1].baseline_m
+    rows[np.arange(1, 4), scales] = -1.0
+    shown = Evidence(1e8 * rows.T @ rows, np.zeros(len(names)))
+    for _ in range(5):
+        prior = file_prior(rig)
+        posterior = shown.given(prior, np.ones(prior.n_groups))
+        shares.append(np.sqrt(posterior.covariance[baselines[0], baselines[0]]) / rig.pairs[0].baseline_m)
+        rig = replace(rig, calibration_sigmas=refined_sigmas(rig, posterior, np.ones(prior.n_groups)))
+        assert rig.calibration_sigmas.estimated
+    assert shares == pytest.approx(np.full(5, shares[0]), rel=0.2)
 
 
 def test_self_calibration_corrects_a_file_that_is_more_wrong_than_any_once_two_windows_agree() -> None:
@@ -731,6 +773,7 @@ def test_calibration_sigmas_in_a_rig_file_are_checked(tmp_path: Path) -> None:
         ("calibration_sigmas: {focal_shar: 0.1}", "focal_share"),
         ("calibration_sigmas: {focal_share: -0.1}", "positive"),
         ("calibration_sigmas: {focal_share: true}", "numbers only"),
+        ("calibration_sigmas: {estimated: 1}", "true or false"),
         ("calibration_sigmas:", "no level given"),
     ):
         (tmp_path / "wrong.yaml").write_text(f"{text}{added}\n")

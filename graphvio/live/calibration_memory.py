@@ -92,7 +92,9 @@ class CalibrationMemory:
         if estimate.is_file_exact and estimate.file_rig is self._rig:
             return False
         if estimate.is_file_exact:  # what was remembered is good enough to stay in force; now it is known better
-            estimate = replace(estimate, difference=estimate.posterior.mean, file_factors=np.ones(1))
+            estimate = replace(
+                estimate, difference=estimate.posterior.mean, file_factors=np.ones_like(estimate.file_factors)
+            )
         self._folder.mkdir(parents=True, exist_ok=True)
         replace_file(self.path, to_text(estimate.rig, self.path.parent))
         for other in self._of_other_rigs():
@@ -137,6 +139,7 @@ def widened(sigmas: CalibrationSigmas, of_file: CalibrationSigmas, passed_s: flo
     return CalibrationSigmas(
         **{
             name: max(min(float(np.hypot(sigma, WALK * np.sqrt(passed_s) * limit)), limit), sigma)
-            for name, sigma, limit in ((name, getattr(sigmas, name), getattr(of_file, name)) for name in vars(of_file))
-        }
+            for name, sigma, limit in ((name, sigmas.values[name], limit) for name, limit in of_file.values.items())
+        },
+        estimated=sigmas.estimated,
     )

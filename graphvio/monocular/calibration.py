@@ -65,24 +65,21 @@ class WindowCalibration:
         self._rows = np.r_[:n, n + GYRO_MATRIX : n + PARAMETERS]
         self._biases = n + np.arange(GYRO_MATRIX)
         self._prior = FilePrior(
-            np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]), whole.group[self._rows]
+            np.ascontiguousarray(whole.covariance[np.ix_(self._rows, self._rows)]),
+            whole.group[self._rows],
+            estimated=whole.estimated and is_estimated,
         )
         self._whole = whole
         self.size = len(self._rows) if is_estimated else 0
         self._evidence = self._kept = Evidence.none(len(self._rows))
         self._bias_walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
         self._walk: Float = _WALK * cholesky(self._prior.covariance)
-        self.factors = self._first_factors = self.exact_factors
+        self.factors = self._first_factors = self._prior.smallest_factors
         self.twice_log_bayes_factor = 0.0
         self.are_stamps_exact = True
         self._files: dict[tuple[float, ...], Gaussian] = {}
         self.latest: CalibrationEstimate | None = None
         self._latest_ns = 0
-
-    @property
-    def exact_factors(self) -> Float:
-        """The factors (G,) of an exact file."""
-        return np.full(self._prior.n_groups, EXACT)
 
     @property
     def is_file_exact(self) -> bool:
@@ -96,6 +93,8 @@ class WindowCalibration:
     @property
     def candidates(self) -> list[Float]:
         """Factors (G,) with which a first window is tried."""
+        if self._prior.estimated and not self.are_stamps_exact:
+            return [np.full(self._prior.n_groups, EXACT)]  # nothing is to be learnt of it: it is taken as it is
         if not (self.is_file_exact and self.size and self.are_stamps_exact):
             return [self.factors]
         return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]

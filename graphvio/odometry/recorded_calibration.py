@@ -31,7 +31,7 @@ _CAMERAS = ("focal_share", "principal_point_px", "distortion_share")
 _STEREO = ("stereo_rotation_deg", "stereo_baseline_share")
 _IMU = ("body_rotation_deg", "body_translation_m", "time_offset_s", "imu_scale_share", "imu_misalignment_deg")
 GROUPS: dict[str, tuple[str, ...]] = {
-    "cameras": _CAMERAS, "stereo": _STEREO, "imu": _IMU, "all": tuple(vars(CalibrationSigmas())),
+    "cameras": _CAMERAS, "stereo": _STEREO, "imu": _IMU, "all": tuple(CalibrationSigmas().values),
 }  # fmt: skip
 """What can be calibrated -> the standard deviations of its parameters, see `CalibrationSigmas`."""
 _FIXED = {"cameras": _STEREO, "stereo": _CAMERAS, "imu": _CAMERAS + _STEREO, "all": ()}

@@ -17,7 +17,7 @@ from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, model_points, ply, trajectory_text, write_g2o
 from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
-from graphvio.optimization.loops.database import FeatureDatabase
+from graphvio.optimization.loops.database import FeatureDatabase, colmap_model
 from graphvio.optimization.loops.features import extract_places
 from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import SessionInput, find_loops
@@ -112,7 +112,7 @@ class Stages:
         calibrates_first: whether each rig is to be calibrated before its session's odometry.
 
     Raises:
-        OptimizationError: if the folder cannot be used.
+        OptimizationError: if the folder cannot be used, or COLMAP, which loop closures need, has no model for a lens.
     """
 
     def __init__(
@@ -125,6 +125,9 @@ class Stages:
         calibrates: bool = False,
         on_progress: Progress | None = None,
     ) -> None:
+        if with_loops:
+            for camera in (camera for each in sessions for camera in each.source.rig.cameras):
+                colmap_model(camera)  # which raises: now, and not after the odometry
         self._sessions = sessions
         self._calibrates = calibrates
         self.calibrates_first = calibrates or config.estimates_calibration

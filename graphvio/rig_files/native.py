@@ -9,7 +9,6 @@ The format is documented with a full example in ``docs/reference/data-contract.m
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields
 from pathlib import Path
 
 from graphvio.calibration_sigmas import FACTORY, LEVELS, CalibrationSigmas
@@ -24,6 +23,7 @@ FILE_NAME = "rig.yaml"
 
 _RIG_KEYS = (VERSION_KEY, "name", "calibration_sigmas", "imu", "pairs")
 _SINGLES_KEY = "single_cameras"
+_ESTIMATED_KEY = "estimated"
 _IMU_MATRICES = ("gyro_matrix", "accel_matrix")
 _IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s", *_IMU_MATRICES)
 _PAIR_KEYS = ("name", "left", "right")
@@ -106,7 +106,9 @@ def to_text(rig: Rig, folder: Path) -> str:
     ]
     if rig.calibration_sigmas != FACTORY:
         lines.append("calibration_sigmas:")
-        lines += [f"  {name}: {_number(value)}" for name, value in vars(rig.calibration_sigmas).items()]
+        lines += [f"  {name}: {_number(value)}" for name, value in rig.calibration_sigmas.values.items()]
+        if rig.calibration_sigmas.estimated:
+            lines.append(f"  {_ESTIMATED_KEY}: true")
     if rig.imu is not None:
         lines += [
             "imu:",
@@ -151,9 +153,10 @@ def _sigmas(document: Section) -> CalibrationSigmas:
             where, levels = document.where("calibration_sigmas"), ", ".join(LEVELS)
             raise RigError(f"{where}: {fault}; use one of {levels}, or a mapping of values")
         return LEVELS[given]
-    section, names = document.section("calibration_sigmas"), [field.name for field in fields(CalibrationSigmas)]
-    section.only(names)
-    return CalibrationSigmas(**{name: section.number(name, getattr(FACTORY, name)) for name in names})
+    section = document.section("calibration_sigmas")
+    section.only([*FACTORY.values, _ESTIMATED_KEY])
+    values = {name: section.number(name, default) for name, default in FACTORY.values.items()}
+    return CalibrationSigmas(**values, estimated=section.flag(_ESTIMATED_KEY))
 
 
 def _singles(document: Section) -> tuple[SingleCamera, ...]:

@@ -66,6 +66,13 @@ class Section:
             raise RigError(f"{self.where(key)}: is {value}, which YAML makes of yes, on, no and off; put it in quotes")
         return str(value)
 
+    def flag(self, key: str) -> bool:
+        """Get true or false; false if it is not given."""
+        value = self.values.get(key, False)
+        if not isinstance(value, bool):
+            raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be true or false")
+        return value
+
     def number(self, key: str, default: float | None = None) -> float:
         """Get a number, which is required if there is no default."""
         if default is not None and self.values.get(key) is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.rig import Rig
-from graphvio.self_calibration.evidence import EXACT, Gaussian
+from graphvio.self_calibration.evidence import EXACT, Gaussian, inexact
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
 from graphvio.self_calibration.parameters import moved_cameras, n_camera_parameters
 from graphvio.self_calibration.prior import refined_sigmas
@@ -53,7 +53,7 @@ class CalibrationEstimate:
         if self.is_file_exact:
             return self.file_rig
         rig = moved_cameras(self.file_rig, self.difference[: self._n_camera_parameters])
-        rig = replace(rig, calibration_sigmas=refined_sigmas(rig, self.posterior))
+        rig = replace(rig, calibration_sigmas=refined_sigmas(rig, self.posterior, inexact(self.file_factors)))
         if rig.imu is None:
             return rig
         gyro, accel = (

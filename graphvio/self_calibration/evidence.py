@@ -25,6 +25,11 @@ Cameras that are not exact reach hundreds with the first image.
 """
 
 
+def inexact(factors: Float) -> Float:
+    """Return the factors (G,) without those of exact parts, which may yet turn out to be wrong."""
+    return np.where(factors == EXACT, 1.0, factors)
+
+
 class Gaussian(NamedTuple):
     """A normal distribution of a calibration's difference from the nominal one.
 
@@ -64,11 +69,24 @@ class FilePrior(NamedTuple):
         covariance: (C, C) of the differences from the file, for factors of 1.
         group: (C,) index of the factor of each parameter, or -1 where none applies: no file has biases.
         change: (C, C) covariance of what knocks have changed since the file was made, or None. No factor applies to it.
+        estimated: whether an estimation found the file's standard deviations. Factors are 1 at least then: what it did
+            not show is as wrong as before, however well it found the parts that measurements show again.
     """
 
     covariance: Float
     group: Int
     change: Float | None = None
+    estimated: bool = False
+
+    @property
+    def factors(self) -> tuple[float, ...]:
+        """Factors that are possible, of any group, from the smallest one."""
+        return tuple(factor for factor in _FACTORS if factor >= 1.0) if self.estimated else _FACTORS
+
+    @property
+    def smallest_factors(self) -> Float:
+        """The factors (G,) of a file that measurements say nothing against: `EXACT`, or 1 where it is estimated."""
+        return np.full(self.n_groups, self.factors[0])
 
     @property
     def n_groups(self) -> int:
@@ -140,20 +158,21 @@ class Evidence(NamedTuple):
 
         Args:
             prior: of the calibration.
-            min_twice_log_ratios: (G,) threshold on twice the log likelihood ratio against an exact file, above which a
-                group is taken to be inexact.
+            min_twice_log_ratios: (G,) threshold on twice the log likelihood ratio against the smallest factor, above
+                which a larger one is taken.
             likelihood: of the same evidence and prior, if there is one already.
 
         Returns:
             The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
-            over that of an exact file.
+            over that of the smallest ones.
         """
         likelihood = likelihood or FactorLikelihood(self, prior)
         groups = list(range(prior.n_groups))
         # Two groups may explain the same, and the one that is varied first then takes it all: each is first once.
-        maxima = [_ascended(likelihood, groups[first:] + groups[:first], min_twice_log_ratios) for first in groups]
+        orders = [groups[first:] + groups[:first] for first in groups]
+        maxima = [_ascended(likelihood, prior, order, min_twice_log_ratios) for order in orders]
         factors = max(maxima, key=likelihood)
-        return factors, likelihood(factors) - likelihood(np.full(prior.n_groups, EXACT))
+        return factors, likelihood(factors) - likelihood(prior.smallest_factors)
 
     def mean_square(self, prior: FilePrior, in_force: Float, likelihood: FactorLikelihood | None = None) -> Float:
         """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
@@ -165,7 +184,7 @@ class Evidence(NamedTuple):
             numpy.linalg.LinAlgError: if the measurements have no likelihood with any factors.
         """
         likelihood = likelihood or FactorLikelihood(self, prior)
-        factors = _factors_that_count(likelihood, prior.n_groups)
+        factors = _factors_that_count(likelihood, prior)
         twice_log = np.array([likelihood(each) for each in factors])
         weights = np.exp(0.5 * (twice_log - twice_log.max()))
         weights /= weights.sum()
@@ -214,45 +233,47 @@ class FactorLikelihood:
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite
 
 
-def _ascended(likelihood: FactorLikelihood, order: Sequence[int], min_twice_log_ratios: Float) -> Float:
-    """Return the factors (G,) to which a coordinate ascent leads from an exact file, for an order of the groups."""
-    factors = np.full(len(order), EXACT)
+def _ascended(
+    likelihood: FactorLikelihood, prior: FilePrior, order: Sequence[int], min_twice_log_ratios: Float
+) -> Float:
+    """Return the factors (G,) to which a coordinate ascent leads from the smallest ones, for an order of the groups."""
+    factors, possible = prior.smallest_factors, prior.factors
     for _ in range(_SWEEPS):
         before = factors.copy()
         for group in order:
             likelihoods = []
-            for factor in _FACTORS:
+            for factor in possible:
                 factors[group] = factor
                 likelihoods.append(likelihood(factors))
             found = int(np.argmax(likelihoods))
             if likelihoods[found] - likelihoods[0] < min_twice_log_ratios[group]:
                 found = 0
-            factors[group] = _FACTORS[found]
+            factors[group] = possible[found]
         if np.array_equal(factors, before):
             break
     return factors
 
 
-def _factors_that_count(likelihood: FactorLikelihood, n_groups: int) -> list[Float]:
+def _factors_that_count(likelihood: FactorLikelihood, prior: FilePrior) -> list[Float]:
     """Return the factors (G,) whose likelihood is not negligible, found from the maxima outwards.
 
     Raises:
         numpy.linalg.LinAlgError: if no factors have a likelihood.
     """
-    groups = list(range(n_groups))
-    maxima = [_ascended(likelihood, groups[first:] + groups[:first], np.zeros(n_groups)) for first in groups]
-    every, margin = np.array(_FACTORS), 2.0 * np.log(_MIN_WEIGHT)
-    known = {tuple(np.searchsorted(every, each).tolist()): likelihood(each) for each in maxima}
+    groups, possible, margin = list(range(prior.n_groups)), np.array(prior.factors), 2.0 * np.log(_MIN_WEIGHT)
+    orders = [groups[first:] + groups[:first] for first in groups]
+    maxima = [_ascended(likelihood, prior, order, np.zeros(len(groups))) for order in orders]
+    known = {tuple(np.searchsorted(possible, each).tolist()): likelihood(each) for each in maxima}
     outward, likeliest = list(known), max(known.values())
     while outward:
         at = outward.pop()
         if known[at] > likeliest + margin:
             # neighbours by one step of any of the factors
-            for neighbour in product(*(range(max(k - 1, 0), min(k + 2, len(every))) for k in at)):
+            for neighbour in product(*(range(max(k - 1, 0), min(k + 2, len(possible))) for k in at)):
                 if neighbour not in known:
-                    known[neighbour] = likelihood(every[list(neighbour)])
+                    known[neighbour] = likelihood(possible[list(neighbour)])
                     likeliest = max(likeliest, known[neighbour])
                     outward.append(neighbour)
     if not np.isfinite(likeliest):
         raise np.linalg.LinAlgError("the measurements fit no calibration")
-    return [every[list(at)] for at, each in known.items() if each > likeliest + margin]
+    return [possible[list(at)] for at, each in known.items() if each > likeliest + margin]

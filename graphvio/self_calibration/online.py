@@ -21,7 +21,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
 from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
+from graphvio.self_calibration.evidence import MAX_FACTOR, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
@@ -84,8 +84,8 @@ class SelfCalibration:
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         n_groups = self._prior.n_groups
         posterior = self._evidence.given(self._prior, np.ones(n_groups))
-        exact = np.full(n_groups, EXACT)
-        self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
+        at_first = self._prior.smallest_factors
+        self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), at_first)
         self.extrinsics: dict[int, Float] = {}
         self.upper_covariance = upper_covariance
         self.restarts = 0

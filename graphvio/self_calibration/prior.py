@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import CalibrationSigmas
 from graphvio.geometry import skew
+from graphvio.linear_algebra import cholesky
 from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.self_calibration.evidence import FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import (
@@ -40,6 +43,10 @@ _BIAS_WALK_FACTOR = 2.0  # on the stated random walks, which are those of a sens
 
 
 _CAMERAS, _EXTRINSICS, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
+_CAMERA_SIGMAS = (
+    "focal_share", "principal_point_px", "distortion_share", "stereo_rotation_deg", "stereo_baseline_share"
+)  # fmt: skip
+"""Standard deviations of the first group."""
 
 
 def file_prior(rig: Rig) -> FilePrior:
@@ -52,14 +59,15 @@ def file_prior(rig: Rig) -> FilePrior:
     group = np.full(n, _CAMERAS)
     for j in range(len(rig.groups)):
         group[extrinsics_of(rig, j)] = _EXTRINSICS
+    estimated = rig.calibration_sigmas.estimated
     if rig.imu is None:
-        return FilePrior(of_cameras, group)
+        return FilePrior(of_cameras, group, estimated=estimated)
     covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
     covariance[:n, :n] = of_cameras
     covariance[n:, n:] = np.diag(_sigmas_of_imu(rig.calibration_sigmas) ** 2)
     of_imu = np.full(PARAMETERS, _EXTRINSICS)
     of_imu[:GYRO_MATRIX] = _NO_GROUP
-    return FilePrior(covariance, np.concatenate([group, of_imu]))
+    return FilePrior(covariance, np.concatenate([group, of_imu]), estimated=estimated)
 
 
 def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
@@ -96,12 +104,18 @@ def extrinsic_covariances(rig: Rig, covariance: Float) -> dict[int, Float]:
     return found
 
 
-def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
+def refined_sigmas(rig: Rig, posterior: Gaussian, factors: Float) -> CalibrationSigmas:
     """Return the standard deviations of a posterior, of each kind of parameter the largest.
 
+    As a rig file's prior they know no correlations, such as those of the baselines with the accelerometer's scale,
+    which measurements show only relative to each other: the next run would take each for known by itself. They are
+    enlarged by one factor, until that prior is in no direction narrower than the posterior, but not beyond what was
+    known before.
+
     Args:
-        rig: with the calibration of the posterior.
-        posterior: of the difference from a rig file.
+        rig: with the calibration of the posterior, and the standard deviations of the rig file.
+        posterior: of the difference from the rig file.
+        factors: (2,) on the file's standard deviations with which it is the posterior.
     """
     covariance, known = posterior.covariance, rig.calibration_sigmas
     of_cameras = covariance[: n_camera_parameters(rig), : n_camera_parameters(rig)]
@@ -129,10 +143,10 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
     imu = _sigmas(covariance, slice(-PARAMETERS, None)) if rig.imu is not None else _sigmas_of_imu(known)
     matrix = imu[GYRO_MATRIX:TIME_OFFSET].reshape(2, 3, 3)
     diagonal = np.diagonal(matrix, axis1=1, axis2=2)
-    return CalibrationSigmas(
+    found = CalibrationSigmas(
         focal_share=focal_share,
         principal_point_px=centre_px,
-        distortion_share=known.distortion_share,
+        distortion_share=max(float(_distortion_shares(camera, sigmas).max()) for camera, sigmas in cameras),
         stereo_rotation_deg=stereo_deg,
         stereo_baseline_share=baseline_share,
         body_rotation_deg=float(np.rad2deg(first[:3].max())),
@@ -143,6 +157,32 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
         imu_scale_share=float(diagonal.max()),
         imu_misalignment_deg=float(np.rad2deg(matrix[:, ~np.eye(3, dtype=bool)].max())),
     )
+    prior = file_prior(replace(rig, calibration_sigmas=found))
+    enlarged = found.scaled(max(_largest_ratio(prior, covariance), 1.0)).values
+    of_file = _scaled(known, factors).values
+    bounded = {name: max(sigma, min(enlarged[name], of_file[name])) for name, sigma in found.values.items()}
+    return CalibrationSigmas(**bounded, estimated=True)
+
+
+def _largest_ratio(prior: FilePrior, covariance: Float) -> float:
+    """Return the largest ratio in any direction of standard deviations of a covariance (C, C) to those of a prior."""
+    with_factor = np.ix_(prior.group >= 0, prior.group >= 0)
+    of_file = cholesky(np.ascontiguousarray(prior.covariance[with_factor]))
+    half = np.linalg.solve(of_file, covariance[with_factor])
+    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.solve(of_file, half.T))[-1]))
+
+
+def _scaled(known: CalibrationSigmas, factors: Float) -> CalibrationSigmas:
+    """Return the standard deviations of a rig file that is wrong by some factors (2,), see `file_prior`."""
+    of_cameras, of_extrinsics = (known.scaled(float(factor)).values for factor in factors)
+    values = of_extrinsics | {name: of_cameras[name] for name in _CAMERA_SIGMAS}
+    return CalibrationSigmas(**values, estimated=known.estimated)
+
+
+def _distortion_shares(camera: Camera, sigmas: Float) -> Float:
+    """Return the standard deviations (DISTORTION,) of a camera's coefficients as shares of what a file's refer to."""
+    size = _distortion_sizes(camera)
+    return np.divide(sigmas[INTRINSICS:], size, out=np.zeros(DISTORTION), where=size > 0.0)
 
 
 def _sigmas(covariance: Float, rows: slice) -> Float:
@@ -196,7 +236,11 @@ def _sigmas_of_lens(camera: Camera, known: CalibrationSigmas) -> Float:
     sigmas = np.zeros(CAMERA)
     sigmas[:2] = known.focal_share * camera.intrinsics[:2]
     sigmas[2:INTRINSICS] = known.principal_point_px
-    given = np.where(has_coefficient(camera), camera.distortion[:DISTORTION], 0.0)
-    size = np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)
-    sigmas[INTRINSICS:] = known.distortion_share * size
+    sigmas[INTRINSICS:] = known.distortion_share * _distortion_sizes(camera)
     return sigmas
+
+
+def _distortion_sizes(camera: Camera) -> Float:
+    """Return what a standard deviation of each coefficient (DISTORTION,) is a share of; 0 where there is none."""
+    given = np.where(has_coefficient(camera), camera.distortion[:DISTORTION], 0.0)
+    return np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)

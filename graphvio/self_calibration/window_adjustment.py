@@ -20,6 +20,7 @@ from graphvio.self_calibration.evidence import (
     FactorLikelihood,
     FilePrior,
     Gaussian,
+    inexact,
 )
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
@@ -88,7 +89,7 @@ class WindowAdjustment:
         """Adjust the window; None where the measurements determine nothing, or an IMU that is impossible."""
         try:
             fitted = self._fitted(self.factors, self.difference)
-            if fitted.solution.has_converged and not np.array_equal(_inexact(fitted.factors), _inexact(self.factors)):
+            if fitted.solution.has_converged and not np.array_equal(inexact(fitted.factors), inexact(self.factors)):
                 # What the window says was linearised where another file led it.
                 fitted = self._fitted(fitted.factors, fitted.solution.calibration.mean)
             return self._judged(fitted) if fitted.solution.has_converged else None
@@ -97,7 +98,7 @@ class WindowAdjustment:
 
     def _fitted(self, factors: Float, difference: Float) -> _Fitted:
         """Solve the window with the rig file as wrong as some factors say, and find which are likeliest then."""
-        prior = self.evidence.given(self.file_prior, _inexact(factors))
+        prior = self.evidence.given(self.file_prior, inexact(factors))
         solution = adjusted(self.keyframes, self.samples, self.nominal, difference, prior, self.sigma_px)
         evidence = self.evidence.with_window(prior, solution.calibration)
         likelihood = FactorLikelihood(evidence, self.file_prior)
@@ -112,7 +113,7 @@ class WindowAdjustment:
             in_force = evidence.given(self.file_prior, factors).mean
         estimate = CalibrationEstimate(
             self.rig,
-            evidence.given(self.file_prior, _inexact(factors)),
+            evidence.given(self.file_prior, inexact(factors)),
             in_force,
             factors,
             fitted.twice_log_bayes_factor,
@@ -141,8 +142,3 @@ class _Fitted(NamedTuple):
     likelihood: FactorLikelihood
     factors: Float
     twice_log_bayes_factor: float
-
-
-def _inexact(factors: Float) -> Float:
-    """Return the factors without those of exact parts, which may yet turn out to be wrong."""
-    return np.where(factors == EXACT, 1.0, factors)

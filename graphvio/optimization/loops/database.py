@@ -32,6 +32,22 @@ def image_name(session: str, camera: str, stamp_ns: int) -> str:
     return f"{session}/{camera}/{stamp_ns}.png"
 
 
+def colmap_model(camera: Camera) -> str:
+    """Return the name of COLMAP's model for a camera's lens.
+
+    Raises:
+        OptimizationError: if it has none.
+    """
+    if camera.model == "radial-tangential" and not camera.distortion[4]:
+        return "OPENCV"
+    if camera.model in _COLMAP_MODELS:
+        return _COLMAP_MODELS[camera.model]
+    raise OptimizationError(
+        f"camera {camera.name}: COLMAP has no model for its {camera.model} lens; for loop closure and maps, "
+        f"calibrate it with one of {', '.join(_COLMAP_MODELS)}; sessions can be optimised with --no-loops"
+    )
+
+
 def colmap_camera(camera: Camera, number: int) -> Any:
     """Return a camera of the rig as a COLMAP camera.
 
@@ -40,18 +56,9 @@ def colmap_camera(camera: Camera, number: int) -> Any:
         MissingExtraError: if the extra ``maps`` is not installed.
     """
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    lens = camera.distortion.tolist()
     centre = [cx + CENTRE_PX, cy + CENTRE_PX]
-    if camera.model == "radial-tangential" and not camera.distortion[4]:
-        model = "OPENCV"
-    elif camera.model in _COLMAP_MODELS:
-        model = _COLMAP_MODELS[camera.model]
-    else:
-        raise OptimizationError(
-            f"camera {camera.name}: COLMAP has no model for its {camera.model} lens; for loop closure and maps, "
-            f"calibrate it with one of {', '.join(_COLMAP_MODELS)}; sessions can be optimised with --no-loops"
-        )
-    lens = lens[: _COLMAP_COEFFICIENTS[model]]
+    model = colmap_model(camera)
+    lens = camera.distortion.tolist()[: _COLMAP_COEFFICIENTS[model]]
     width, height = camera.size_px
     return colmap().Camera(
         model=model, width=width, height=height, params=[fx, fy, *centre, *lens], camera_id=number,
