@@ -370,6 +370,21 @@ def test_refined_sigmas_hold_what_measurements_show_only_together_however_often_
     assert shares == pytest.approx(np.full(5, shares[0]), rel=0.2)
 
 
+@pytest.mark.parametrize("has_distortion", [True, False])
+@pytest.mark.parametrize("has_imu", [True, False])
+def test_refined_sigmas_are_half_as_large_where_all_is_known_twice_as_well(has_distortion: bool, has_imu: bool) -> None:
+    rig = default_rig() if has_imu else default_rig().without_imu()
+    if not has_distortion:  # as of images that were rectified
+        rig = rig.with_cameras(lambda camera: replace(camera, distortion=np.zeros_like(camera.distortion)))
+    prior = file_prior(rig)
+    posterior = Gaussian(np.zeros(len(prior.group)), np.asarray(4.0 * np.linalg.inv(prior.covariance), np.float64))
+    found, of_file = refined_sigmas(rig, posterior, np.ones(prior.n_groups)).values, rig.calibration_sigmas.values
+    unknown = set() if has_imu else {"time_offset_s", "imu_scale_share", "imu_misalignment_deg"}
+    unknown |= set() if has_distortion else {"distortion_share"}
+    for name, sigma in found.items():
+        assert sigma == pytest.approx((1.0 if name in unknown else 0.5) * of_file[name], rel=0.05)
+
+
 def test_self_calibration_corrects_a_file_that_is_more_wrong_than_any_once_two_windows_agree() -> None:
     true = default_rig().without_imu().with_pairs([0])
     front = true.pairs[0]

@@ -140,13 +140,15 @@ def refined_sigmas(rig: Rig, posterior: Gaussian, factors: Float) -> Calibration
             float(np.hypot(focal_share, SINGLE_FOCAL_SHARE)),
             float(np.hypot(centre_px, SINGLE_CENTRE_PX)),
         )
+    # Cameras of rectified images have no coefficients.
+    distortion_share = max(float(_distortion_shares(camera, sigmas).max()) for camera, sigmas in cameras)
     imu = _sigmas(covariance, slice(-PARAMETERS, None)) if rig.imu is not None else _sigmas_of_imu(known)
     matrix = imu[GYRO_MATRIX:TIME_OFFSET].reshape(2, 3, 3)
     diagonal = np.diagonal(matrix, axis1=1, axis2=2)
     found = CalibrationSigmas(
         focal_share=focal_share,
         principal_point_px=centre_px,
-        distortion_share=max(float(_distortion_shares(camera, sigmas).max()) for camera, sigmas in cameras),
+        distortion_share=distortion_share or known.distortion_share,
         stereo_rotation_deg=stereo_deg,
         stereo_baseline_share=baseline_share,
         body_rotation_deg=float(np.rad2deg(first[:3].max())),
