@@ -245,7 +245,10 @@ def test_run_with_a_wrong_place_of_the_single_camera_learns_it(walk: Path, tmp_p
     found = learnt.pairs[0].left.cam_T_body @ learnt.singles[0].left.body_T_cam
     exact = rig.pairs[0].left.cam_T_body @ camera.body_T_cam
     off_deg = np.rad2deg(so3_log(np.ascontiguousarray(found[:3, :3] @ exact[:3, :3].T)))
-    assert np.abs(off_deg).max() < 3.0 * learnt.calibration_sigmas.pair_rotation_deg < 0.2
+    # What is written for the next run is wider than what was found: a file has no correlations.
+    sigma_deg = learnt.calibration_sigmas.pair_rotation_deg
+    assert np.abs(off_deg).max() < min(3.0 * sigma_deg, 0.2)
+    assert sigma_deg < rig.calibration_sigmas.pair_rotation_deg / 3.0
     assert EventKind.EXTRINSICS_OFF in (tmp_path / "wrong" / "events.jsonl").read_text()
 
 
