@@ -120,14 +120,7 @@ def equations(
     gradient[of_gravity] += along * excess / _GRAVITY_NORM_SIGMA**2
     cost += 0.5 * (excess / _GRAVITY_NORM_SIGMA) ** 2
     if prior is not None:
-        m = len(prior.at.poses)
-        off = states.of(np.arange(m)).since(prior.at)
-        columns = columns_of(n, np.arange(m), n_free)
-        pull = times(prior.information, off)
-        size = len(columns)
-        add_block(hessian, columns, prior.information)
-        gradient[columns] += (prior.gradient + pull)[:size]
-        cost += float((prior.gradient * off + 0.5 * off * pull).sum())
+        cost += add_prior(prior, states, n_free, hessian, gradient)
     if file is not None:
         away = states.calibration - file.mean
         pull = times(file.information, away)
@@ -135,6 +128,25 @@ def equations(
         gradient[known:] += pull
         cost += 0.5 * float((away * pull).sum())
     return Equations(hessian, gradient, cost, errors2, inertial.errors2, eliminated)
+
+
+def add_prior(prior: Prior, states: States, n_free: int, hessian: Float, gradient: Float) -> float:
+    """Add what is known from before a window to its equations, and return its cost.
+
+    Args:
+        prior: of the first states.
+        states: all of the window, at which the equations are.
+        n_free: number of the calibration's parameters that are unknown, F or 0.
+        hessian: is added to.
+        gradient: is added to.
+    """
+    first = np.arange(len(prior.at.poses))
+    off = states.of(first).since(prior.at)
+    pull = times(prior.information, off)
+    columns = columns_of(len(states.poses), first, n_free)
+    add_block(hessian, columns, prior.information)
+    gradient[columns] += (prior.gradient + pull)[: len(columns)]
+    return float((prior.gradient * off + 0.5 * off * pull).sum())
 
 
 def adjust(

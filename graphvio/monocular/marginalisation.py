@@ -7,7 +7,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.linear_algebra import product, solve_rows
 from graphvio.measurements.window_views import FirstWindow
-from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements, times
+from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements, add_prior, times
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.states import (
     BIASES,
@@ -64,11 +64,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         hessian[at, at] += 1.0 / ZERO_VELOCITY_SIGMA**2
         gradient[at] += states.velocities[0] / ZERO_VELOCITY_SIGMA**2
     if prior is not None:
-        m = len(prior.at.poses)
-        off = states.of(np.arange(m)).since(prior.at)
-        columns = columns_of(n, np.arange(m), n_free)
-        add_block(hessian, columns, prior.information)
-        gradient[columns] += prior.gradient + times(prior.information, off)
+        add_prior(prior, states, n_free, hessian, gradient)
     leaving, kept = columns_of(n, np.arange(1))[:9], columns_of(n, np.arange(1, n), n_free)
     gain = solve_rows(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(kept, leaving)])
     if not np.isfinite(gain).all():
