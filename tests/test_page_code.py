@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import served
 from calibration_walks import recorded
-from command_line import graphvio, python
+from command_line import Ran, graphvio, python
 from other_systems import write_openvins, write_orb_slam3, write_vins_fusion
 from pages import PAGES, ROOT, python_blocks, typed
 from rendered import copy_part
@@ -65,11 +65,15 @@ def commands_of(page: str) -> list[list[str]]:
     return [arguments for arguments in found if not any(re.search(each, " ".join(arguments)) for each in NEED)]
 
 
-def run_commands(page: str, folder: Path, more: Callable[[list[str]], list[str]] = lambda arguments: arguments) -> None:
+def run_commands(
+    page: str, folder: Path, more: Callable[[list[str]], list[str]] = lambda arguments: arguments
+) -> list[Ran]:
     """Run the commands of a page in a folder, each with ``more`` of what a test needs; none may fail."""
+    every = []
     for arguments in commands_of(page):
-        ran = graphvio(*more(arguments), folder=folder)
-        assert ran.returncode == 0, f"{arguments}: {ran.stderr}"
+        every.append(graphvio(*more(arguments), folder=folder))
+        assert every[-1].returncode == 0, f"{arguments}: {every[-1].stderr}"
+    return every
 
 
 def run_python(page: str, folder: Path, before: str = "") -> str:
@@ -212,7 +216,8 @@ def for_a_second(arguments: list[str]) -> list[str]:
 
 def test_live(session: Path, tmp_path: Path) -> None:
     shutil.copy(session / "walk.mcap", tmp_path)
-    run_commands("docs/how-to/live.md", tmp_path, for_a_second)
+    for ran in run_commands("docs/how-to/live.md", tmp_path, for_a_second):
+        assert re.search(r"^[1-9]\d* estimates of", ran.stdout, re.MULTILINE)
 
 
 @pytest.mark.usefixtures("without_plots")
@@ -271,7 +276,7 @@ def test_ros2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("cyclonedds")
     monkeypatch.setenv("CYCLONEDDS_URI", URI)
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain()))
-    run_python("docs/how-to/sensors/ros2.md", tmp_path, SERVED)
+    assert not run_python("docs/how-to/sensors/ros2.md", tmp_path, SERVED)  # it publishes, and prints nothing
 
 
 def test_server_of_the_slam_interface(tmp_path: Path) -> None:
