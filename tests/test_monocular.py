@@ -22,7 +22,7 @@ from graphvio import Odometry, RigError, load_rig, open_source, save_rig
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
-from graphvio.geometry import se3_inverse, so3_exp, so3_log
+from graphvio.geometry import se3_adjoint, se3_inverse, so3_exp, so3_log
 from graphvio.live.running import LiveOdometry
 from graphvio.live.source import SelectedCameras
 from graphvio.live.sources import open_live_source
@@ -30,7 +30,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.motion import CameraTracks, CrossCameraMatches, HandedOverTracks
 from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
-from graphvio.monocular.adjustment import Measurements, adjust, covariance_of, equations, scale_sigma
+from graphvio.monocular.adjustment import Measurements, add_prior, adjust, covariance_of, equations, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.equations import visual_equations
@@ -519,6 +519,55 @@ def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool,
     part = covariance_of(remaining.equations.hessian, np.arange(len(off)))
     assert np.abs(off / np.sqrt(np.diag(part))).max() < 0.05
     np.testing.assert_allclose(np.sqrt(np.diag(part)), np.sqrt(np.diag(whole)), rtol=1e-3)
+
+
+def prior_between_poses(rng: np.random.Generator) -> tuple[States, Prior, Float]:
+    """Return three states, a prior that knows their poses to each other, and the same states turned and moved."""
+    states = States(np.arange(3), np.tile(np.eye(4), (3, 1, 1)), np.zeros((3, 3)), np.zeros(3), np.zeros(6))
+    states = states.moved(rng.normal(size=36))
+    rows = np.zeros((12, 36))
+    for k in range(2):  # the next pose seen from this one, to first order
+        i_T_j = se3_inverse(states.poses[k]) @ states.poses[k + 1]
+        rows[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = -se3_adjoint(np.ascontiguousarray(se3_inverse(i_T_j)))
+        rows[6 * k : 6 * k + 6, 6 * k + 6 : 6 * k + 12] = np.eye(6)
+    information: Float = 1e6 * rows.T @ rows
+    return states, Prior(states, information, np.zeros(36)), 0.05 * rng.normal(size=36)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_equations_of_a_prior_are_the_derivatives_of_its_cost(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    states, prior, step = prior_between_poses(rng)
+    prior = prior._replace(gradient=1e3 * rng.normal(size=36))
+    turned = states.moved(step)
+
+    def cost(of_step: Float) -> float:
+        return add_prior(prior, turned.moved(of_step), 0, np.zeros((36, 36)), np.zeros(36))
+
+    hessian, gradient = np.zeros((36, 36)), np.zeros(36)
+    add_prior(prior, turned, 0, hessian, gradient)
+    numeric = np.array([(cost(1e-5 * e) - cost(-1e-5 * e)) / 2e-5 for e in np.eye(36)])
+    np.testing.assert_allclose(gradient, numeric, atol=1e-5 * np.abs(gradient).max())
+    by_step = np.array(
+        [
+            turned.moved(1e-6 * e).since(prior.at) - turned.moved(-1e-6 * e).since(prior.at)
+            for e in np.eye(36)
+        ]
+    ).T / 2e-6  # fmt: skip
+    np.testing.assert_allclose(hessian, by_step.T @ prior.information @ by_step, atol=1e-6 * np.abs(hessian).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_prior_that_knows_only_relative_poses_does_not_learn_positions_when_the_poses_turn(seed: int) -> None:
+    states, prior, step = prior_between_poses(np.random.default_rng(seed))
+    turned = states.moved(step)
+    hessian = np.zeros((36, 36))
+    add_prior(prior, turned, 0, hessian, np.zeros(36))
+    for axis in np.eye(3):
+        all_move = np.zeros(36)
+        for k in range(3):
+            all_move[6 * k + 3 : 6 * k + 6] = turned.poses[k, :3, :3].T @ axis
+        assert all_move @ hessian @ all_move < 1e-9 * prior.information.max()
 
 
 def test_factors_of_the_rig_file_change_only_for_clearly_likelier_ones() -> None:

@@ -19,6 +19,7 @@ from graphvio.monocular.states import (
     add_block,
     columns_of,
     inertial_columns,
+    of_perturbations,
     visual_columns,
 )
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
@@ -144,8 +145,11 @@ def add_prior(prior: Prior, states: States, n_free: int, hessian: Float, gradien
     off = states.of(first).since(prior.at)
     pull = times(prior.information, off)
     columns = columns_of(len(states.poses), first, n_free)
-    add_block(hessian, columns, prior.information)
-    gradient[columns] += (prior.gradient + pull)[: len(columns)]
+    information, total = of_perturbations(
+        prior.information, prior.gradient + pull, states.poses[: len(first)], prior.at.poses
+    )
+    add_block(hessian, columns, information)
+    gradient[columns] += total[: len(columns)]
     return float((prior.gradient * off + 0.5 * off * pull).sum())
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.geometry import so3_exp, so3_log
+from graphvio.geometry import so3_exp, so3_log, so3_right_jacobian_inverse
 from graphvio.kernels import kernel
 from graphvio.monocular.reprojection import Cameras
 from graphvio.self_calibration.imu_model import PARAMETERS
@@ -140,6 +140,39 @@ def add_block(hessian: Float, columns: Int, block: Float) -> None:
     for r in range(len(columns)):
         for c in range(len(columns)):
             hessian[columns[r], columns[c]] += block[r, c]
+
+
+@kernel
+def of_perturbations(information: Float, gradient: Float, poses: Float, before: Float) -> tuple[Float, Float]:
+    """Return the information and gradient of perturbed poses, from those of their differences as by `States.since`.
+
+    A perturbation is in the body's axes as they are now, and a difference in those of before. Where the two are taken
+    for the same, a prior pretends to know where the whole window is, and which way it faces, once poses have turned.
+
+    Args:
+        information: (N, N) of all unknowns, the poses first.
+        gradient: (N,).
+        poses: (K, 4, 4) that are perturbed.
+        before: (K, 4, 4) from which the differences are.
+    """
+    changed, total = information.copy(), gradient.copy().reshape(-1, 1)
+    for k in range(len(poses)):
+        before_R_now = before[k, :3, :3].T.copy() @ poses[k, :3, :3].copy()
+        by_rotation = so3_right_jacobian_inverse(so3_log(before_R_now))
+        for at, by in ((6 * k, by_rotation), (6 * k + 3, before_R_now)):
+            _turn_rows(by, at, changed)
+            _turn_rows(by, at, changed.T)
+            _turn_rows(by, at, total)
+    return changed, total[:, 0]
+
+
+@kernel
+def _turn_rows(by: Float, at: int, matrix: Float) -> None:
+    """Multiply three rows of a matrix (N, M), from one on, by the transpose of ``by`` (3, 3)."""
+    for c in range(matrix.shape[1]):
+        first, second, third = matrix[at, c], matrix[at + 1, c], matrix[at + 2, c]
+        for r in range(3):
+            matrix[at + r, c] = by[0, r] * first + by[1, r] * second + by[2, r] * third
 
 
 def size_m(positions: Float) -> float:
