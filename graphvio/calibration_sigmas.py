@@ -8,6 +8,9 @@ import numpy as np
 
 from graphvio.errors import RigError
 
+_MARGIN_SIGMAS = 3.0
+_MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
+
 
 @dataclass(frozen=True)
 class CalibrationSigmas:
@@ -57,10 +60,16 @@ class CalibrationSigmas:
         """The standard deviations by name."""
         return {name: value for name, value in vars(self).items() if name != "estimated"}
 
-    def epipolar_px(self, focal_px: float) -> float:
-        """Return the standard deviation by which epipolar lines are off near the middle of the image."""
-        turned = np.deg2rad(self.stereo_rotation_deg) * focal_px
-        return float(np.hypot(turned, np.sqrt(2.0) * self.principal_point_px))
+    def epipolar_margin_px(self, focal_px: float, rotation_deg: float) -> float:
+        """Return by how much epipolar lines may be off near the middle of the image: 3 sigma, but no more than 5 px.
+
+        Args:
+            focal_px: of the cameras.
+            rotation_deg: standard deviation of their rotation to each other.
+        """
+        turned_px = np.deg2rad(rotation_deg) * focal_px
+        sigma_px = float(np.hypot(turned_px, np.sqrt(2.0) * self.principal_point_px))
+        return min(_MARGIN_SIGMAS * sigma_px, _MAX_MARGIN_PX)
 
     def scaled(self, factor: float) -> CalibrationSigmas:
         """Return all standard deviations times a factor."""

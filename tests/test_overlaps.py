@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.overlaps import MIN_OVERLAP
 from graphvio.frontend.singles import SinglesFrontend
+from graphvio.geometry import so3_exp
 from graphvio.rig import Camera, Rig, axes_angle_deg, overlap
 from graphvio.simulation import Simulator, build_scene, default_rig
 from graphvio.simulation.named_rigs import headset, phone, surround
@@ -137,6 +139,65 @@ def test_tracks_are_found_where_other_cameras_see_their_points(
     assert counts[0] > 20 * len(cameras)
     assert counts[1] > 0.9 * counts[0]
     frontend.close()
+
+
+def turned_in_file(rig: Rig, degrees: float) -> Rig:
+    """Return a rig file whose cameras are turned at random, and whose principal points are 2 px off."""
+    rng = np.random.default_rng(3)
+
+    def wrong(camera: Camera) -> Camera:
+        turned = camera.body_T_cam.copy()
+        turned[:3, :3] = turned[:3, :3] @ so3_exp(np.deg2rad(degrees) * rng.normal(size=3))
+        fx, fy, cx, cy = camera.intrinsics
+        return replace(camera, body_T_cam=turned, intrinsics=np.array([fx, fy, cx + 2.0, cy - 2.0]))
+
+    return rig.with_cameras(wrong)
+
+
+def matches_at_first_sight(frontend: SinglesFrontend, simulator: OnceRendered, file: Rig) -> tuple[int, Float]:
+    """Return how many tracks are found in other cameras, and their distances, in pixels, from where they are."""
+    cameras = [single.left for single in simulator.rig.singles]
+    of_file = [single.left for single in file.singles]
+    errors = [np.zeros(0)]
+    for j, tracks in frontend.process(simulator.frameset(0), lambda _: np.eye(4)).camera_tracks.items():
+        pixels = frontend.frames_at(simulator.stamps_ns[0])[j].pixels
+        np.testing.assert_allclose(tracks.rays, of_file[j].unproject(pixels)[0], atol=1e-12)
+        columns, rows = np.rint(pixels).astype(int).T
+        depths = simulator.view(0, j).depth[rows, columns]
+        for seen in tracks.matches:
+            own_rays = cameras[j].unproject(pixels[seen.rows])[0]
+            expected = true_pixels(cameras[j], own_rays, depths[seen.rows], cameras[seen.camera])
+            there = of_file[seen.camera].project(np.column_stack([seen.rays, np.ones(len(seen.rays))]))[0]
+            errors.append(np.linalg.norm(there - expected, axis=1))
+    frontend.close()
+    return sum(map(len, errors)), np.concatenate(errors)
+
+
+def test_epipolar_lines_are_those_of_the_calibration_in_force_and_rays_those_of_the_rig_file() -> None:
+    rig = four_cameras()
+    file = turned_in_file(rig, 1.0)
+    simulator = OnceRendered(build_scene("room", 1.0), rig, 1)
+    found = {}
+    for name, calibration in (("file", file), ("true", rig)):
+        frontend = SinglesFrontend(file, Config())
+        frontend.recalibrate(calibration, 0.0)
+        found[name] = matches_at_first_sight(frontend, simulator, file)
+    assert found["true"][0] > 4 * found["file"][0]
+    assert np.median(found["true"][1]) < 0.1
+
+
+def test_a_margin_finds_points_beside_the_epipolar_lines_of_a_file_that_is_a_little_wrong() -> None:
+    rig = four_cameras()
+    file = turned_in_file(rig, 0.2)
+    simulator = OnceRendered(build_scene("room", 1.0), rig, 1)
+    counts = []
+    for margin_px in (0.0, 5.0):
+        frontend = SinglesFrontend(file, Config())
+        frontend.recalibrate(file, margin_px)
+        count, errors = matches_at_first_sight(frontend, simulator, file)
+        counts.append(count)
+    assert counts[1] > 2 * counts[0]
+    assert np.median(errors) < 0.3
 
 
 def test_rolling_shutters_and_cameras_that_look_apart_share_nothing() -> None:

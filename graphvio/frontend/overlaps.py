@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.frontend.warped_matching import WarpedMatcher
 from graphvio.measurements.motion import CrossCameraMatches
-from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, StereoPair, axes_angle_deg, overlap
+from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, axes_angle_deg, overlap
 
 if TYPE_CHECKING:
     from graphvio.frontend.tracker import GroupTracker
@@ -48,13 +49,13 @@ class TrackedImage:
 
 
 @dataclass(frozen=True, eq=False)
-class _Apart:
-    """Two cameras that look too different ways for a stereo pair."""
+class _TwoCameras:
+    """Two cameras that see the same: near each other like a stereo pair, or looking different ways."""
 
     left: Camera
     right: Camera
 
-    @property
+    @cached_property
     def right_T_left(self) -> Float:
         return np.ascontiguousarray(self.right.cam_T_body @ self.left.body_T_cam)
 
@@ -83,13 +84,21 @@ class Overlaps:
 
     def __init__(self, rig: Rig, config: Config) -> None:
         self._sigma_px = config.motion.pixel_sigma_px
-        cameras = [single.left for single in rig.singles]
+        self._of_file = cameras = [single.left for single in rig.singles]
         self._partners = [
             [_partner(own, k, other, config) for k, other in enumerate(cameras) if _is_shared(own, other)]
             for own in cameras
         ]
         shared = [max((overlap(own, other) for other in cameras if other is not own), default=0.0) for own in cameras]
         self._hands_over = [each < _MAX_HANDOVER_OVERLAP for each in shared]
+
+    def recalibrate(self, rig: Rig, epipolar_margin_px: float) -> None:
+        """Search by another calibration of the same cameras from now on, whose epipolar lines may be off by so much."""
+        cameras = [single.left for single in rig.singles]
+        for own, partners in zip(cameras, self._partners, strict=True):
+            for partner in partners:
+                partner.cameras = _TwoCameras(own, cameras[partner.camera])
+                partner.matcher.recalibrate(partner.cameras, epipolar_margin_px)
 
     def find(
         self,
@@ -114,13 +123,16 @@ class Overlaps:
                 self._find(partner, own, views[partner.camera], cam_T_before, searches, wanted)
 
     def matches_of(self, camera: int, frame: TrackedFrame) -> tuple[CrossCameraMatches, ...]:
-        """Return where other cameras see the tracks of a camera's newest frame."""
+        """Return where other cameras see the tracks of a camera's newest frame, by the lenses of the rig file."""
         found = []
         for partner in self._partners[camera]:
             if partner.found.stamp_ns == frame.stamp_ns:
                 there = partner.found
                 rows = np.searchsorted(frame.ids, there.ids)
-                found.append(CrossCameraMatches(partner.camera, rows, there.right_rays))
+                of_file, rays = self._of_file[partner.camera], there.right_rays
+                if partner.cameras.right is not of_file:
+                    rays, _ = of_file.unproject(there.right_pixels)
+                found.append(CrossCameraMatches(partner.camera, rows, rays))
         return tuple(found)
 
     def found_in(self, camera: int, stamp_ns: int, leaving: Mapping[int, Leaving]) -> list[FoundThere]:
@@ -199,11 +211,10 @@ def _is_shared(own: Camera, other: Camera) -> bool:
 
 
 def _partner(own: Camera, number: int, other: Camera, config: Config) -> _Partner:
+    cameras, (width, height) = _TwoCameras(own, other), other.size_px
     if axes_angle_deg(own, other) > MAX_AXES_ANGLE_DEG:
-        apart = _Apart(own, other)
-        return _Partner(number, apart, WarpedMatcher(apart, config))
-    pair, (width, height) = StereoPair(f"{own.name} in {other.name}", own, other), other.size_px
-    return _Partner(number, pair, StereoMatcher(pair, config, np.ones((height, width), dtype=bool)))
+        return _Partner(number, cameras, WarpedMatcher(cameras, config))
+    return _Partner(number, cameras, StereoMatcher(cameras, config, np.ones((height, width), dtype=bool)))
 
 
 def _agrees(there: TrackedFrame, leaving: Leaving, sigma_px: float) -> Bool:

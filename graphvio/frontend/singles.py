@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from graphvio.arrays import Bool, Int
+from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.frontend.handover import Handover, Leaving
 from graphvio.frontend.images import ImageMask
@@ -29,8 +29,21 @@ class SinglesFrontend(TrackingFrontend):
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         super().__init__(rig, config, image_mask)
+        self._file_rig = rig
         self._overlaps = Overlaps(rig, config)
         self._handover = Handover(len(rig.singles))
+
+    def recalibrate(self, rig: Rig, epipolar_margin_px: float) -> None:
+        """Track and match by another calibration of the same cameras from the next frameset on.
+
+        What is measured stays rays by the lenses of the rig file, from which the back-end estimates the calibration.
+
+        Args:
+            rig: with the calibration.
+            epipolar_margin_px: by how much its epipolar lines may be off, added to what matches may be off.
+        """
+        self._recalibrate(rig, epipolar_margin_px, {})
+        self._overlaps.recalibrate(rig, epipolar_margin_px)
 
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
         """Find the tracks in all cameras; what they show of the motion, the back-end measures."""
@@ -95,9 +108,15 @@ class SinglesFrontend(TrackingFrontend):
             chosen = ~of_others[j] if wanted is None else wanted[j]
             self._overlaps.find(j, images, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
             matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
-            return CameraTracks(frames[j].ids, frames[j].left_rays, matches, handed_over)
+            return CameraTracks(frames[j].ids, self._rays_by_file(j, frames[j]), matches, handed_over)
 
         return self._in_parallel(find, frames)
+
+    def _rays_by_file(self, camera: int, frame: TrackedFrame) -> Float:
+        """Return the rays (N, 2) of a camera's tracks by the lens of the rig file."""
+        if self._rig is self._file_rig:
+            return frame.left_rays
+        return self._file_rig.singles[camera].left.unproject(frame.pixels_at_stamp)[0]
 
     @timed("handover")
     def _handed_over(self, frames: dict[int, TrackedFrame]) -> dict[int, TrackedFrame]:

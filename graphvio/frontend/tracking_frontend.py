@@ -155,6 +155,21 @@ class TrackingFrontend(ABC):
         """End the threads."""
         self._workers.shutdown()
 
+    def _recalibrate(self, rig: Rig, epipolar_margin_px: float, uncertain: Mapping[int, Float]) -> None:
+        """Track, match and locate by another calibration from now on; arguments as `VisualFrontend.recalibrate`."""
+        self._rig = rig
+        self._extrinsics.recalibrate(rig, uncertain)
+        for tracker, group in zip(self._trackers, rig.groups, strict=True):
+            tracker.recalibrate(group, epipolar_margin_px)
+        self._move_trackers()
+        self._references.recalibrate(rig)
+        self._latest = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._latest.items()}
+
+    def _move_trackers(self) -> None:
+        """Give the single cameras' trackers the poses by which they locate points."""
+        for j in range(len(self._rig.pairs), len(self._rig.groups)):
+            self._trackers[j].move(self._extrinsics.arrays.body_T_left[j])
+
     @timed("track")
     def _track(
         self,

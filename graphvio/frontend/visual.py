@@ -80,14 +80,8 @@ class VisualFrontend(TrackingFrontend):
         new_T_old = rig.pairs[0].left.body_T_cam @ self._rig.pairs[0].left.cam_T_body
         for history in self._histories:
             history.recalibrate(new_T_old)
-        self._rig = rig
         self._baselines_m = _baselines_m(rig)
-        self._extrinsics.recalibrate(rig, uncertain)
-        for tracker, group in zip(self._trackers, rig.groups, strict=True):
-            tracker.recalibrate(group, epipolar_margin_px)
-        self._move_trackers()
-        self._references.recalibrate(rig)
-        self._latest = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._latest.items()}
+        self._recalibrate(rig, epipolar_margin_px, uncertain)
 
     # ------------------------------------------------------------------ one frameset
 
@@ -259,11 +253,6 @@ class VisualFrontend(TrackingFrontend):
                 continue
             motions[j] = self._relative_motion(seen, self._extrinsics.uncorrected(j, refined))
         return motions
-
-    def _move_trackers(self) -> None:
-        """Give the single cameras' trackers the poses by which they locate points."""
-        for j in range(len(self._rig.pairs), len(self._rig.groups)):
-            self._trackers[j].move(self._extrinsics.arrays.body_T_left[j])
 
 
 def _baselines_m(rig: Rig) -> list[float]:

@@ -144,6 +144,7 @@ class Odometry:
         if not self.config.estimates_calibration:
             return FixedCalibration()
         if isinstance(estimator, MonocularEstimator):
+            assert isinstance(frontend, SinglesFrontend)
             return SinglesCalibration(rig, frontend, self._synchroniser, estimator, self.report)
         assert isinstance(frontend, VisualFrontend)
         return PairsCalibration(rig, self.config, frontend, self._synchroniser, estimator, self.report)

@@ -27,8 +27,6 @@ from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import n_camera_parameters
 
-_MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
-_MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
 _MAX_TURN_RAD = np.deg2rad(0.3)  # a larger correction of the cameras' attitude begins a new keyframe
 _DISTRUST_SIGMAS = 5.0  # if an IMU parameter changes by more than this, predictions made before are wrong
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
@@ -221,5 +219,5 @@ class PairsCalibration:
         """Return by how much epipolar lines may be off: by the rig file's errors until these are estimated."""
         if self._calibration.is_trusted:
             return 0.0
-        sigma_px = max(self._rig.calibration_sigmas.epipolar_px(pair.left.focal_px) for pair in self._rig.pairs)
-        return min(_MARGIN_SIGMAS * sigma_px, _MAX_MARGIN_PX)
+        sigmas, focal_px = self._rig.calibration_sigmas, max(pair.left.focal_px for pair in self._rig.pairs)
+        return sigmas.epipolar_margin_px(focal_px, sigmas.stereo_rotation_deg)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.tracking_frontend import TrackingFrontend
+from graphvio.frontend.singles import SinglesFrontend
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
@@ -27,8 +27,8 @@ _KEYFRAME_INTERVAL_S = 0.25  # of the windows for a calibration from the whole r
 class SinglesCalibration:
     """An `OnlineCalibration` of a rig of single cameras and an IMU, whose `MonocularEstimator` estimates it.
 
-    The time offset is passed on to the synchroniser, contradictions of the rig file to people. Innovation tests and the
-    pose's covariance know of the calibration's errors, since these are states.
+    The cameras are passed on to the front-end, the time offset to the synchroniser, contradictions of the rig file to
+    people. Innovation tests and the pose's covariance know of the calibration's errors, since these are states.
 
     Args:
         rig: Of the rig file.
@@ -41,13 +41,13 @@ class SinglesCalibration:
     def __init__(
         self,
         rig: Rig,
-        frontend: TrackingFrontend,
+        frontend: SinglesFrontend,
         synchroniser: Synchroniser,
         estimator: MonocularEstimator,
         report: Report,
     ) -> None:
         assert rig.imu is not None
-        self._imu = rig.imu
+        self._rig, self._imu = rig, rig.imu
         self._frontend = frontend
         self._synchroniser = synchroniser
         self._estimator = estimator
@@ -58,6 +58,7 @@ class SinglesCalibration:
         self._epoch = 0
         self._collector = WindowCollector(rig)
         self._on_full_window: Callable[[FullWindow], None] | None = None
+        self._use_rig_file()
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
@@ -85,6 +86,7 @@ class SinglesCalibration:
 
     def restart_imu(self) -> None:
         """Forget what was learnt by another clock."""
+        self._use_rig_file()
         self._estimate, self._was_wrong = None, False
         self._collector.restart()
         self._collector.forget_samples()
@@ -115,6 +117,8 @@ class SinglesCalibration:
         estimate = self._estimator.calibration
         if estimate is None or estimate is self._estimate:
             return
+        if self._estimate is None or not estimate.is_file_exact:
+            self._frontend.recalibrate(estimate.rig, 0.0)
         self._estimate = estimate
         shift_s = self._imu.time_offset_s + estimate.time_offset_s - self._synchroniser.time_offset_s
         self._synchroniser.add_to_time_offset(shift_s)
@@ -134,3 +138,9 @@ class SinglesCalibration:
 
     def close(self) -> None:
         """Do nothing: nothing runs beside the odometry."""
+
+    def _use_rig_file(self) -> None:
+        """Let the front-end track by the rig file, and find points of other cameras as far off as that may be wrong."""
+        sigmas = self._rig.calibration_sigmas
+        focal_px = max(single.left.focal_px for single in self._rig.singles)
+        self._frontend.recalibrate(self._rig, sigmas.epipolar_margin_px(focal_px, sigmas.pair_rotation_deg))
