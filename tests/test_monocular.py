@@ -36,7 +36,7 @@ from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.monocular.initialiser import POSE_SIGMAS
-from graphvio.monocular.marginalisation import without_first
+from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import Prior, States, first_prior
@@ -519,6 +519,30 @@ def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool,
     part = covariance_of(remaining.equations.hessian, np.arange(len(off)))
     assert np.abs(off / np.sqrt(np.diag(part))).max() < 0.05
     np.testing.assert_allclose(np.sqrt(np.diag(part)), np.sqrt(np.diag(whole)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("calibrates", [False, True])
+def test_landmarks_that_are_held_between_keyframes_say_the_same_as_when_solved_for(calibrates: bool) -> None:
+    measured, states, landmarks, prior = problem(14, shares=True, calibrates=calibrates)
+    file = WindowCalibration(overlapping_rig()).file(np.ones(2)) if calibrates else None
+    states, landmarks, measured, _ = adjust(measured, states, landmarks, prior, 12, file)
+    n = len(states.poses)
+    held = measured.structure.state[measured.structure.rows[1:] - 1] < n - 1
+    assert 0.2 < held.mean() < 0.8
+    kept = with_landmarks(
+        measured._replace(structure=measured.structure.of(held)), states.of(np.arange(n - 1)), landmarks[held], prior,
+        calibrates,
+    )  # fmt: skip
+    step = np.zeros(9 * n + 9)
+    step[6 * n - 6 : 6 * n] = 0.01
+    predicted = states.moved(step)
+    whole = adjust(measured, predicted, landmarks, prior, 5, file)
+    others = measured._replace(structure=measured.structure.of(~held))
+    part = adjust(others, predicted, landmarks[~held], kept, 5, file)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(whole.equations.hessian)))
+    off = part.states.since(whole.states)[: len(sigmas)]
+    assert np.abs(off / sigmas).max() < 0.02
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(part.equations.hessian))), sigmas, rtol=2e-3)
 
 
 def prior_between_poses(rng: np.random.Generator) -> tuple[States, Prior, Float]:

@@ -166,7 +166,7 @@ class Initialiser:
                 measured, states, places = self._roughly_adjusted(measured, states, places, prior, file)
             adjusted = adjust(measured, states, places, prior, _STEPS, file)
             states = adjusted.states
-            landmarks.put(adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
+            landmarks.put(ids, adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
             off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, MAX_OFF)
             if file is not None and is_first:
                 factors = self._calibration.likeliest_factors(evidence_of(adjusted.equations, states, file))

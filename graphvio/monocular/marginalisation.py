@@ -41,16 +41,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         numpy.linalg.LinAlgError: if nothing determines the first state.
     """
     n, n_camera_parameters, n_free = len(states.poses), states.n_camera_parameters, len(states.calibration)
-    eliminated = Eliminated.empty(measured.structure, n_camera_parameters)
-    visual_hessian, visual_gradient, _, _ = visual_equations(
-        states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
-        ROBUST_SCALE, eliminated,
-    )  # fmt: skip
-    size = 9 * n + GRAVITY + BIASES + n_free
-    hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    of_views = visual_columns(n, n_camera_parameters, n_free)
-    add_block(hessian, of_views, visual_hessian)
-    gradient[of_views] += visual_gradient
+    hessian, gradient = _linearised(measured, states, landmarks, prior, n_free)
     if n > 1:
         two = states.of(np.arange(2))
         first = measured.samples._replace(keyframes_ns=measured.samples.keyframes_ns[:2])
@@ -63,8 +54,6 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         at = 6 * n + np.arange(3)
         hessian[at, at] += 1.0 / ZERO_VELOCITY_SIGMA**2
         gradient[at] += states.velocities[0] / ZERO_VELOCITY_SIGMA**2
-    if prior is not None:
-        add_prior(prior, states, n_free, hessian, gradient)
     leaving, kept = columns_of(n, np.arange(1))[:9], columns_of(n, np.arange(1, n), n_free)
     gain = solve_rows(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(kept, leaving)])
     if not np.isfinite(gain).all():
@@ -75,6 +64,22 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
     return Prior(states.of(np.arange(1, n)), 0.5 * (information + information.T), pulled)
 
 
+def with_landmarks(
+    measured: Measurements, states: States, landmarks: Float, prior: Prior | None, calibrates: bool
+) -> Prior:
+    """Add what some landmarks say of the states of a window to what is known from before, linearised at these states.
+
+    Args:
+        measured: with these landmarks, and no others.
+        states: all of the window.
+        landmarks: (L, 3).
+        prior: from before.
+        calibrates: whether the calibration is unknown.
+    """
+    n_free = len(states.calibration) if calibrates else 0
+    return Prior(states, *_linearised(measured, states, landmarks, prior, n_free))
+
+
 def first_window(prior: Prior) -> FirstWindow:
     """Return what a prior says of poses, gravity, biases and the first velocity: of others it says nothing."""
     n = len(prior.at.poses)
@@ -83,6 +88,26 @@ def first_window(prior: Prior) -> FirstWindow:
         prior.at.stamps_ns, prior.at.poses, prior.at.velocities[0], prior.at.gravity, prior.at.biases,
         prior.information[np.ix_(chosen, chosen)], prior.gradient[chosen],
     )  # fmt: skip
+
+
+def _linearised(
+    measured: Measurements, states: States, landmarks: Float, prior: Prior | None, n_free: int
+) -> tuple[Float, Float]:
+    """Linearise views and prior; the calibration's parameters, F of them or none, are unknown."""
+    n, n_camera_parameters = len(states.poses), states.n_camera_parameters
+    eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
+    visual_hessian, visual_gradient, _, _ = visual_equations(
+        states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
+        ROBUST_SCALE, eliminated,
+    )  # fmt: skip
+    size = 9 * n + GRAVITY + BIASES + len(states.calibration)
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    of_views = visual_columns(n, n_camera_parameters, n_free)
+    add_block(hessian, of_views, visual_hessian)
+    gradient[of_views] += visual_gradient
+    if prior is not None:
+        add_prior(prior, states, n_free, hessian, gradient)
+    return hessian, gradient
 
 
 def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Float]:

@@ -203,9 +203,11 @@ class Landmarks:
         structure = Structure(frames, bounds, state[rows], camera[rows], np.ascontiguousarray(rays[rows]))
         return structure, places, ids
 
-    def put(self, frames: Float, places: Float) -> None:
-        """Set new frames (L, 4, 4) of the landmarks that were last collected, and their places (L, 3) there."""
-        self._frames, self._places = frames, places
+    def put(self, ids: Int, frames: Float, places: Float) -> None:
+        """Set new frames (L, 4, 4) of landmarks (L,) that were last collected, and their places (L, 3) there."""
+        rows = np.searchsorted(self._ids, ids)
+        self._frames, self._places = self._frames.copy(), self._places.copy()
+        self._frames[rows], self._places[rows] = frames, places
 
     def turn(self, new_T_odom: Float) -> None:
         """Express the landmarks in another frame."""

@@ -16,12 +16,12 @@ from graphvio.measurements.motion import LocatedPoints
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, covariance_of, views_only
 from graphvio.monocular.calibration import WindowCalibration, time_offset_s
-from graphvio.monocular.marginalisation import first_window, without_first
+from graphvio.monocular.marginalisation import first_window, with_landmarks, without_first
 from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
-from graphvio.monocular.states import States
+from graphvio.monocular.states import Prior, States
 from graphvio.monocular.structure import Structure
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 from graphvio.self_calibration.pixel_noise import pixel_noise
@@ -50,6 +50,25 @@ class Solution(NamedTuple):
     dropped: Mapping[int, Int]
 
 
+class _Held(NamedTuple):
+    """Landmarks that the newest keyframe does not see: until the next one, what they say stays as it was linearised.
+
+    They are three quarters of all, and what they say of the keyframes hardly changes.
+
+    Attributes:
+        ids: of the landmarks.
+        prior: what they say of the keyframes, with what is known from before.
+    """
+
+    ids: Int
+    prior: Prior
+
+    def holds(self, window: KeyframeWindow) -> bool:
+        """Return whether a window has the same keyframes, and a newest state that sees none of the landmarks."""
+        are_same = np.array_equal(window.states.stamps_ns[:-1], self.prior.at.stamps_ns)
+        return are_same and not np.isin(self.ids, window.views[-1].landmark).any()
+
+
 class WindowSolver:
     """Solver of a rig's windows, one after the other.
 
@@ -73,6 +92,7 @@ class WindowSolver:
         self._cameras = cameras
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
+        self._held: _Held | None = None
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
 
@@ -113,23 +133,27 @@ class WindowSolver:
         Raises:
             numpy.linalg.LinAlgError: if the measurements do not determine them.
         """
-        calibration = self.calibration
+        calibration, prior = self.calibration, window.prior
         structure, places, ids = self._structure(window)
+        if not is_keyframe and self._held is not None and self._held.holds(window):
+            prior, others = self._held.prior, ~np.isin(ids, self._held.ids)
+            structure, places, ids = structure.of(others), places[others], ids[others]
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
-        adjusted = adjust(measured, window.states, places, window.prior, steps, calibration.file())
+        adjusted = adjust(measured, window.states, places, prior, steps, calibration.file())
         if is_keyframe and calibration.update_factors(adjusted, window.prior):
             measured, places = adjusted.measured, adjusted.landmarks
             adjusted = adjust(measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file())
         window.states = adjusted.states
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
-        window.landmarks.put(adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
+        window.landmarks.put(ids, adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
         is_tracking, dropped = self._leave_out_moving(window, structure, ids, adjusted.equations.errors2)
         self._solved = Solved(adjusted, ids, window.views[-1])
         self.covariance = _newest_covariance(adjusted)
         if is_keyframe:
             calibration.note(stamp_ns, adjusted.states, self.covariance)
             self._finish_keyframe(window, adjusted)
+            self._held = self._hold(window)
         return Solution(adjusted.equations.imu_errors2, is_tracking, dropped)
 
     def end(self, window: KeyframeWindow) -> None:
@@ -145,7 +169,7 @@ class WindowSolver:
 
     def forget(self) -> None:
         """Forget what the last window said of the newest state."""
-        self._solved, self.covariance = None, NO_COVARIANCE
+        self._solved, self._held, self.covariance = None, None, NO_COVARIANCE
 
     # ------------------------------------------------------------------ parts of these steps
 
@@ -157,6 +181,14 @@ class WindowSolver:
     def _measured(self, window: KeyframeWindow, structure: Structure) -> Measurements:
         samples = self.samples.between(window.states.stamps_ns, self.calibration.is_file_exact)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
+
+    def _hold(self, window: KeyframeWindow) -> _Held:
+        """Linearise what a keyframe's window knows by landmarks that the keyframe does not see."""
+        structure, places, ids = self._structure(window)
+        held = ~np.isin(ids, window.views[-1].landmark)
+        measured = self._measured(window, structure.of(held))
+        calibrates = self.calibration.file() is not None
+        return _Held(ids[held], with_landmarks(measured, window.states, places[held], window.prior, calibrates))
 
     def _leave_out_moving(
         self, window: KeyframeWindow, structure: Structure, ids: Int, errors2: Float
