@@ -101,6 +101,12 @@ def so3_right_jacobian(phi: Float) -> Float:
 
 
 @kernel
+def so3_left_jacobian(phi: Float) -> Float:
+    """Compute the left Jacobian (3, 3): ``exp(phi + d) = exp(J d) exp(phi)`` to first order."""
+    return so3_right_jacobian(-phi)
+
+
+@kernel
 def so3_right_jacobian_inverse(phi: Float) -> Float:
     """Compute the inverse (3, 3) of `so3_right_jacobian`: ``log(exp(phi) exp(d)) = phi + J^-1 d`` to first order."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]

@@ -106,6 +106,15 @@ def product(a: Float, b: Float) -> Float:
 
 
 @kernel
+def turn_rows(by: Float, at: int, matrix: Float) -> None:
+    """Multiply three rows of a matrix (N, M), from one on, by the transpose of ``by`` (3, 3)."""
+    for c in range(matrix.shape[1]):
+        first, second, third = matrix[at, c], matrix[at + 1, c], matrix[at + 2, c]
+        for r in range(3):
+            matrix[at + r, c] = by[0, r] * first + by[1, r] * second + by[2, r] * third
+
+
+@kernel
 def squared_length(vector: Float, covariance: Float) -> float:
     """Return ``v^T C^-1 v`` of a vector (N,): its squared Mahalanobis length; NaN where C is not positive definite."""
     white = solve_lower(cholesky(covariance), vector.reshape(1, -1))

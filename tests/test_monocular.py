@@ -419,6 +419,9 @@ def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_
     shares: bool, calibrates: bool
 ) -> None:
     measured, states, landmarks, _ = problem(4, shares=shares, calibrates=calibrates)
+    if calibrates:  # far from the file, a camera's rotation vector and what turns it are not the same
+        places = states.calibration[: states.n_camera_parameters].reshape(-1, SINGLE)[:, PLACE : PLACE + 3]
+        places += np.array([0.02, -0.03, 0.01])
     _, gradient, _ = at_best(measured, states, landmarks)
     of_pixels = 6 * 4 + states.n_camera_parameters - SINGLE + np.arange(INTRINSICS)
     for unknown in [*range(24), *calibration_unknowns(states)]:

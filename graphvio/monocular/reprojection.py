@@ -9,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.cameras import N_ESTIMATED, distort, distortion_basis
-from graphvio.geometry import so3_exp
+from graphvio.geometry import so3_exp, so3_left_jacobian
 from graphvio.kernels import kernel
 from graphvio.rig import Rig
 from graphvio.self_calibration.observation import MIN_DEPTH_RATIO
@@ -35,6 +35,7 @@ class Cameras(NamedTuple):
         intrinsics: (C, 4) ``[fx, fy, cx, cy]`` of the rig file, by which pixels became rays.
         distortion: (C, 8) of the rig file, likewise.
         lenses: (C, 9) difference of intrinsics and distortion from these.
+        turns: (C, 3, 3) by which the difference of a camera's rotation vector turns it in body, to first order.
     """
 
     body_T_cam: Float
@@ -43,6 +44,7 @@ class Cameras(NamedTuple):
     intrinsics: Float
     distortion: Float
     lenses: Float
+    turns: Float
 
     @staticmethod
     def of(rig: Rig) -> "Cameras":
@@ -55,15 +57,17 @@ class Cameras(NamedTuple):
             np.array([camera.intrinsics for camera in cameras]),
             np.array([camera.distortion for camera in cameras]),
             np.zeros((len(cameras), CAMERA)),
+            np.tile(np.eye(3), (len(cameras), 1, 1)),
         )
 
     def moved(self, difference: Float) -> "Cameras":
-        """Return the cameras that differ from these by a vector (C * SINGLE,)."""
+        """Return the cameras that differ from these, of the rig file, by a vector (C * SINGLE,)."""
         each, body_T_cam = difference.reshape(-1, SINGLE), self.body_T_cam.copy()
+        turns = np.array([so3_left_jacobian(place[:3].copy()) for place in each[:, PLACE:]])
         for pose, place in zip(body_T_cam, each[:, PLACE:], strict=True):
             pose[:3, :3] = so3_exp(place[:3].copy()) @ pose[:3, :3]
             pose[:3, 3] += place[3:]
-        return self._replace(body_T_cam=body_T_cam, lenses=self.lenses + each[:, :PLACE])
+        return self._replace(body_T_cam=body_T_cam, lenses=self.lenses + each[:, :PLACE], turns=turns)
 
 
 @kernel
@@ -126,6 +130,7 @@ def whiten_view(
         Whether the landmark is in front of the camera.
     """
     a, b, w, body_T_cam = landmark[0], landmark[1], landmark[2], cameras.body_T_cam[j]
+    turns = cameras.turns[j]
     scale = cameras.focal_px[j] / sigma_px
     from_x, from_y, from_z = frame[0, 3] - pose[0, 3], frame[1, 3] - pose[1, 3], frame[2, 3] - pose[2, 3]
     odom_x = frame[0, 0] * a + frame[0, 1] * b + frame[0, 2] + w * from_x
@@ -169,8 +174,8 @@ def whiten_view(
         if len(by_lens):
             for c in range(CAMERA):
                 rows[r, c] = -scale * by_lens[r, c]
-            rows[r, PLACE] = m1 * left_z - m2 * left_y
-            rows[r, PLACE + 1] = m2 * left_x - m0 * left_z
-            rows[r, PLACE + 2] = m0 * left_y - m1 * left_x
+            turn_x, turn_y, turn_z = m1 * left_z - m2 * left_y, m2 * left_x - m0 * left_z, m0 * left_y - m1 * left_x
+            for c in range(3):
+                rows[r, PLACE + c] = turn_x * turns[0, c] + turn_y * turns[1, c] + turn_z * turns[2, c]
             rows[r, PLACE + 3], rows[r, PLACE + 4], rows[r, PLACE + 5] = -w * m0, -w * m1, -w * m2
     return True

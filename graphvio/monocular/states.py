@@ -16,6 +16,7 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp, so3_log, so3_right_jacobian_inverse
 from graphvio.kernels import kernel
+from graphvio.linear_algebra import turn_rows
 from graphvio.monocular.reprojection import Cameras
 from graphvio.self_calibration.imu_model import PARAMETERS
 
@@ -160,19 +161,10 @@ def of_perturbations(information: Float, gradient: Float, poses: Float, before: 
         before_R_now = before[k, :3, :3].T.copy() @ poses[k, :3, :3].copy()
         by_rotation = so3_right_jacobian_inverse(so3_log(before_R_now))
         for at, by in ((6 * k, by_rotation), (6 * k + 3, before_R_now)):
-            _turn_rows(by, at, changed)
-            _turn_rows(by, at, changed.T)
-            _turn_rows(by, at, total)
+            turn_rows(by, at, changed)
+            turn_rows(by, at, changed.T)
+            turn_rows(by, at, total)
     return changed, total[:, 0]
-
-
-@kernel
-def _turn_rows(by: Float, at: int, matrix: Float) -> None:
-    """Multiply three rows of a matrix (N, M), from one on, by the transpose of ``by`` (3, 3)."""
-    for c in range(matrix.shape[1]):
-        first, second, third = matrix[at, c], matrix[at + 1, c], matrix[at + 2, c]
-        for r in range(3):
-            matrix[at + r, c] = by[0, r] * first + by[1, r] * second + by[2, r] * third
 
 
 def size_m(positions: Float) -> float:
