@@ -15,6 +15,7 @@ from graphvio.monocular.structure import Structure, located
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.parameters import SINGLE
 from graphvio.self_calibration.preintegration import preintegrate
 from graphvio.self_calibration.prior import file_prior
 
@@ -36,6 +37,7 @@ def warm_up_keyframe_window(rig: Rig) -> None:
     )
     places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
     adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)
+    cameras.moved(np.zeros(SINGLE * len(rig.singles)))
     covariance_of(np.eye(6), np.arange(6))
     eigen(np.eye(7))
     preintegrate(*samples[:2], 0, second // 10, np.zeros(PARAMETERS), samples.noise_densities, samples.max_gap_ns)
