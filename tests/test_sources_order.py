@@ -82,6 +82,26 @@ def test_clean_stamps_keeps_the_first_of_equal_ones() -> None:
     assert kept.tolist() == [True, True, False, False, True]
 
 
+@pytest.mark.parametrize("before", [100, 30])  # most rows are before, or after
+def test_clean_stamps_names_the_row_where_a_clock_was_set_back(before: int) -> None:
+    stamps = np.arange(130) * 50 * MS + 7_200_000 * MS
+    stamps[before:] -= 3_600_000 * MS
+    faults = FaultLog("any")
+    assert clean_stamps(stamps, "frame", Path("x.csv"), faults).sum() == 100
+    (event,) = faults.events
+    assert event.stamp_ns == stamps[before]
+    assert f"data row {before + 1} goes back by 3600.0 s; 30 rows are dropped" in event.detail  # but for the period
+
+
+@pytest.mark.parametrize("late", [[40], [20, 60, 90], list(range(30, 35))])
+def test_clean_stamps_names_no_clock_for_rows_that_are_out_of_order(late: list[int]) -> None:
+    stamps = np.arange(130) * 50 * MS
+    stamps[late] -= 2_000 * MS + MS
+    faults = FaultLog("any")
+    clean_stamps(stamps, "frame", Path("x.csv"), faults)
+    assert "is out of order" in faults.events[0].detail
+
+
 @given(
     steps=st.lists(st.integers(8, 60), min_size=1, max_size=30),
     jitter=st.lists(st.integers(-TOLERANCE_NS // 2, TOLERANCE_NS // 2), min_size=30, max_size=30),
