@@ -22,6 +22,7 @@ from graphvio.geometry import (
     se3_right_jacobian_inverse,
     skew,
     so3_exp,
+    so3_left_jacobian,
     so3_log,
     so3_right_jacobian,
     so3_right_jacobian_inverse,
@@ -118,6 +119,7 @@ def test_so3_right_jacobian_and_inverse(angle: float) -> None:
         jacobian = numerical(lambda d, phi=phi: so3_log(so3_exp(-phi) @ so3_exp(phi + d)), 3)  # type: ignore[misc]
         np.testing.assert_allclose(so3_right_jacobian(phi), jacobian, atol=2e-9)
         np.testing.assert_allclose(so3_right_jacobian_inverse(phi) @ so3_right_jacobian(phi), np.eye(3), atol=1e-10)
+        np.testing.assert_allclose(so3_left_jacobian(phi), so3_exp(phi) @ jacobian, atol=2e-9)
 
 
 @pytest.mark.parametrize("angle", ANGLES)

@@ -129,9 +129,7 @@ class Overlaps:
             if partner.found.stamp_ns == frame.stamp_ns:
                 there = partner.found
                 rows = np.searchsorted(frame.ids, there.ids)
-                of_file, rays = self._of_file[partner.camera], there.right_rays
-                if partner.cameras.right is not of_file:
-                    rays, _ = of_file.unproject(there.right_pixels)
+                rays, _ = self._of_file[partner.camera].unproject(there.right_pixels)
                 found.append(CrossCameraMatches(partner.camera, rows, rays))
         return tuple(found)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Bool, Int
 from graphvio.config import Config
 from graphvio.frontend.handover import Handover, Leaving
 from graphvio.frontend.images import ImageMask
@@ -29,7 +29,7 @@ class SinglesFrontend(TrackingFrontend):
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         super().__init__(rig, config, image_mask)
-        self._file_rig = rig
+        self._of_file = [single.left for single in rig.singles]  # by whose lenses rays are measured
         self._overlaps = Overlaps(rig, config)
         self._handover = Handover(len(rig.singles))
 
@@ -108,15 +108,10 @@ class SinglesFrontend(TrackingFrontend):
             chosen = ~of_others[j] if wanted is None else wanted[j]
             self._overlaps.find(j, images, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
             matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
-            return CameraTracks(frames[j].ids, self._rays_by_file(j, frames[j]), matches, handed_over)
+            rays, _ = self._of_file[j].unproject(frames[j].pixels_at_stamp)
+            return CameraTracks(frames[j].ids, rays, matches, handed_over)
 
         return self._in_parallel(find, frames)
-
-    def _rays_by_file(self, camera: int, frame: TrackedFrame) -> Float:
-        """Return the rays (N, 2) of a camera's tracks by the lens of the rig file."""
-        if self._rig is self._file_rig:
-            return frame.left_rays
-        return self._file_rig.singles[camera].left.unproject(frame.pixels_at_stamp)[0]
 
     @timed("handover")
     def _handed_over(self, frames: dict[int, TrackedFrame]) -> dict[int, TrackedFrame]:

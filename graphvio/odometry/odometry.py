@@ -143,8 +143,7 @@ class Odometry:
         rig, frontend, estimator = self.rig, self._frontend, self._estimator
         if not self.config.estimates_calibration:
             return FixedCalibration()
-        if isinstance(estimator, MonocularEstimator):
-            assert isinstance(frontend, SinglesFrontend)
+        if isinstance(estimator, MonocularEstimator) and isinstance(frontend, SinglesFrontend):
             return SinglesCalibration(rig, frontend, self._synchroniser, estimator, self.report)
         assert isinstance(frontend, VisualFrontend)
         return PairsCalibration(rig, self.config, frontend, self._synchroniser, estimator, self.report)

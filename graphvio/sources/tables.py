@@ -188,29 +188,26 @@ def clean_stamps(stamps_ns: Int, sensor: Literal["imu", "frame"], path: Path, fa
     kept[increasing] = ~_far_from_all(stamps_ns[increasing])
     dropped = ~increasing
     duplicate = dropped & np.isin(stamps_ns, stamps_ns[increasing])
+    backward = dropped & ~duplicate
     for kind, rows, reason in (
         ("duplicate", duplicate, "repeats an earlier row's; the first is kept"),
-        ("backward", dropped & ~duplicate, "is out of order; the row is dropped"),
+        ("backward", backward, f"is out of order; the row is dropped{_clock_set_back(stamps_ns, backward)}"),
         ("outlier", increasing & ~kept, "lies hours from all others; the row is dropped"),
     ):
         if rows.any():
-            step = _step_back(stamps_ns, rows) if kind == "backward" else None
-            row = int(np.argmax(rows)) if step is None else step
-            if step is not None:
-                by_s = 1e-9 * (stamps_ns[step - 1] - stamps_ns[step])
-                reason = (
-                    f"goes back by {by_s:.1f} s; {np.sum(rows)} rows are dropped: to use all, split the recording there"
-                )
+            row = int(np.argmax(rows))
             detail = f"{path}: stamp {stamps_ns[row]} of data row {row + 1} {reason}"
             faults.add(EventKind(f"{sensor}_{kind}"), int(stamps_ns[row]), detail, int(np.sum(rows)))
     return kept
 
 
-def _step_back(stamps_ns: Int, dropped: Bool) -> int | None:
-    """Return the row where a clock was set back, if the dropped rows (N,) are those that are by it before or after."""
+def _clock_set_back(stamps_ns: Int, dropped: Bool) -> str:
+    """Say where a clock was set back, and what to do, if the dropped rows (N,) are all those before or after that."""
     rows, steps = np.flatnonzero(dropped), np.flatnonzero(np.diff(stamps_ns) < 0) + 1
-    are_together = len(rows) >= _MIN_ROWS and rows[-1] - rows[0] == len(rows) - 1
-    return int(steps[0]) if are_together and len(steps) == 1 else None
+    if len(steps) != 1 or len(rows) < _MIN_ROWS or rows[-1] - rows[0] >= len(rows):
+        return ""
+    row, by_s = int(steps[0]), 1e-9 * (stamps_ns[steps[0] - 1] - stamps_ns[steps[0]])
+    return f", as are {len(rows)}: at data row {row + 1} the clock goes back by {by_s:.1f} s; to use all, split there"
 
 
 def _far_from_all(stamps_ns: Int) -> Bool:
