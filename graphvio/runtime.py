@@ -36,6 +36,11 @@ _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # ---------------------------------------------------------------------- threads and memory
 
 
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def set_up_threads() -> None:
     """Switch off OpenCV's own threads in this process, and let Python's take turns every half millisecond.
 

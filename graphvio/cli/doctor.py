@@ -10,6 +10,7 @@ from typing import Any
 
 from graphvio.cli.json_output import publish
 from graphvio.errors import MissingRequirementError
+from graphvio.runtime import usable_cores
 
 REQUIRED = {
     "gtsam": "gtsam",
@@ -108,7 +109,7 @@ def examine() -> dict[str, Any]:
         "versions": versions,
         "platform": platform.platform(),
         "executable": sys.executable,
-        "cores": {"present": os.cpu_count() or 1, "usable": _usable_cores()},
+        "cores": {"present": os.cpu_count() or 1, "usable": usable_cores()},
         "optional": {
             name: {
                 "version": _version(package) if find_spec(module) else None,
@@ -138,10 +139,6 @@ def kernel_modules() -> list[str]:
             parts = file.relative_to(package.parent).with_suffix("").parts
             found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
     return found
-
-
-def _usable_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _version(package: str) -> str | None:

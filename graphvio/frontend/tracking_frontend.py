@@ -27,6 +27,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.measurements.motion import VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
+from graphvio.runtime import usable_cores
 from graphvio.timing import timed
 
 MotionPredictor = Callable[[int], Float | None]
@@ -59,7 +60,7 @@ class TrackedFrameset(NamedTuple):
 
 
 class TrackingFrontend(ABC):
-    """Tracks every pair and single camera, each in a thread of its own.
+    """Tracks every pair and single camera, in as many threads as cores.
 
     Args:
         rig: Stereo pairs and single cameras.
@@ -86,7 +87,8 @@ class TrackingFrontend(ABC):
         self._references = References(config.motion)
         self._standstill = Standstill()
         self._has_rolling_shutter = any(camera.line_time_us for camera in rig.cameras)
-        self._workers = ThreadPoolExecutor(len(rig.groups), thread_name_prefix="graphvio-pair")
+        self._n_threads = min(len(rig.groups), usable_cores())  # with more, they wait for each other
+        self._workers = ThreadPoolExecutor(self._n_threads, thread_name_prefix="graphvio-pair")
 
     def process(
         self,
@@ -207,12 +209,18 @@ class TrackingFrontend(ABC):
         reference = self._references.shared(frames)
         return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
 
-    def _in_parallel(self, work: Callable[[int], _Result], pairs: Iterable[int]) -> dict[int, _Result]:
-        """Work on each pair, all but the first in threads of their own."""
-        ordered = sorted(pairs)
-        others = [(j, self._workers.submit(work, j)) for j in ordered[1:]]
-        frames = {j: work(j) for j in ordered[:1]}
-        return frames | {j: other.result() for j, other in others}
+    def _in_parallel(self, work: Callable[[int], _Result], groups: Iterable[int]) -> dict[int, _Result]:
+        """Work on each pair and single camera, in as many threads as cores, each of which takes the next one."""
+        remaining = iter(sorted(groups))
+
+        def work_on_next() -> dict[int, _Result]:
+            return {j: work(j) for j in remaining}
+
+        others = [self._workers.submit(work_on_next) for _ in range(self._n_threads - 1)]
+        results = work_on_next()
+        for other in others:
+            results |= other.result()
+        return dict(sorted(results.items()))
 
     def _predicted(self, pair: int, then: TrackedFrame | None, motion_since: MotionPredictor) -> Float | None:
         """Predict the motion of points in a pair's left camera since one of its frames."""

@@ -163,6 +163,8 @@ class WindowCalibration:
     def update_factors(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Update the factors of the rig file from a window, and return whether they have changed.
 
+        Of a file that is exact once a second, since it takes a linearisation of its own.
+
         Args:
             adjusted: window.
             prior: from before the window.
@@ -171,7 +173,8 @@ class WindowCalibration:
             return False
         file = self.file()
         if file is None:
-            return self.update(self._evidence_of(adjusted, prior))
+            is_due = int(adjusted.states.stamps_ns[-1]) - self._latest_ns >= _ESTIMATE_EVERY_NS
+            return is_due and self.update(self._evidence_of(adjusted, prior))
         return self.update(evidence_of(adjusted.equations, adjusted.states, file))
 
     def _evidence_of(self, adjusted: Adjusted, prior: Prior | None) -> Evidence:

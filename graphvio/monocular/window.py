@@ -62,3 +62,8 @@ class KeyframeWindow:
         """Add what the cameras see from the newest state: camera -> tracks."""
         self.views.append(self.landmark_ids.join(camera_tracks))
         self.stationary.append(is_stationary)
+
+    def without_newest(self) -> KeyframeWindow:
+        """Return the window as it was before the newest state, with the same landmarks."""
+        kept = self.states.of(np.arange(len(self.states.poses) - 1))
+        return replace(self, states=kept, views=self.views[:-1], stationary=self.stationary[:-1])

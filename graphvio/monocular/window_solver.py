@@ -93,6 +93,7 @@ class WindowSolver:
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
         self._held: _Held | None = None
+        self._may_hold = False  # whether the state before the newest one is a keyframe that was solved for
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
 
@@ -134,9 +135,10 @@ class WindowSolver:
             numpy.linalg.LinAlgError: if the measurements do not determine them.
         """
         calibration, prior = self.calibration, window.prior
+        held = None if is_keyframe else self._held_landmarks(window)
         structure, places, ids = self._structure(window)
-        if not is_keyframe and self._held is not None and self._held.holds(window):
-            prior, others = self._held.prior, ~np.isin(ids, self._held.ids)
+        if held is not None:
+            prior, others = held.prior, ~np.isin(ids, held.ids)
             structure, places, ids = structure.of(others), places[others], ids[others]
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
@@ -153,7 +155,7 @@ class WindowSolver:
         if is_keyframe:
             calibration.note(stamp_ns, adjusted.states, self.covariance)
             self._finish_keyframe(window, adjusted)
-            self._held = self._hold(window)
+            self._held, self._may_hold = None, True
         return Solution(adjusted.equations.imu_errors2, is_tracking, dropped)
 
     def end(self, window: KeyframeWindow) -> None:
@@ -169,7 +171,7 @@ class WindowSolver:
 
     def forget(self) -> None:
         """Forget what the last window said of the newest state."""
-        self._solved, self._held, self.covariance = None, None, NO_COVARIANCE
+        self._solved, self._held, self._may_hold, self.covariance = None, None, False, NO_COVARIANCE
 
     # ------------------------------------------------------------------ parts of these steps
 
@@ -181,6 +183,15 @@ class WindowSolver:
     def _measured(self, window: KeyframeWindow, structure: Structure) -> Measurements:
         samples = self.samples.between(window.states.stamps_ns, self.calibration.is_file_exact)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
+
+    def _held_landmarks(self, window: KeyframeWindow) -> _Held | None:
+        """Return the landmarks that are held since the newest keyframe, or None where they have to be solved for.
+
+        They are linearised at the first frameset after the keyframe, and not at all where that is one, too.
+        """
+        if self._may_hold:
+            self._held, self._may_hold = self._hold(window.without_newest()), False
+        return self._held if self._held is not None and self._held.holds(window) else None
 
     def _hold(self, window: KeyframeWindow) -> _Held:
         """Linearise what a keyframe's window knows by landmarks that the keyframe does not see."""
