@@ -87,7 +87,9 @@ class TrackedFrame:
         """Return the frame with only some of its tracks (N,)."""
         if rows.all():
             return self
-        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+        kept = np.flatnonzero(rows)
+        columns: dict[str, Any] = {name: np.take(getattr(self, name), kept, axis=0) for name in _COLUMNS}
+        return replace(self, **columns)
 
     def extended(self, other: TrackedFrame) -> TrackedFrame:
         """Append the tracks of another frame of this instant, whose ids are greater; counts and times add up."""

@@ -56,12 +56,14 @@ class Views(NamedTuple):
         camera, landmark = self.camera[order], self.landmark[order]
         again = np.zeros(len(order), dtype=bool)
         again[order[1:]] = (camera[1:] == camera[:-1]) & (landmark[1:] == landmark[:-1])
-        return self._rows(~again) if again.any() else self
+        return self._rows(~again)
 
     def _rows(self, kept: Bool) -> Views:
+        if kept.all():
+            return self
         return Views(
-            self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept], self.rays[kept],
-            self.is_adopted[kept],
+            self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept],
+            np.compress(kept, self.rays, axis=0), self.is_adopted[kept],
         )  # fmt: skip
 
 
@@ -186,22 +188,24 @@ class Landmarks:
         state = np.concatenate([np.full(len(each.landmark), k) for k, each in enumerate(views)])
         camera = np.concatenate([each.camera for each in views])
         rays = np.concatenate([each.rays for each in views])
-        order = np.lexsort((camera, state, landmark))
-        landmark, state, camera, rays = landmark[order], state[order], camera[order], rays[order]
-        ids, firsts, counts = np.unique(landmark, return_index=True, return_counts=True)
+        order = np.argsort((landmark * len(views) + state) * len(cameras.body_T_cam) + camera)  # these are unique
+        landmark = landmark[order]
+        bounds = np.flatnonzero(np.diff(landmark, prepend=-1, append=-1))
+        counts = np.diff(bounds)
         seen_twice = counts > 1
-        rows = np.repeat(seen_twice, counts)
-        ids, firsts = ids[seen_twice], firsts[seen_twice]
-        frames = poses[state[firsts]] @ cameras.body_T_cam[camera[firsts]]
+        ids = landmark[bounds[:-1][seen_twice]]
+        order = order[np.repeat(seen_twice, counts)]
+        bounds = np.r_[0, np.cumsum(counts[seen_twice])]
+        state, camera, rays = state[order], camera[order], np.take(rays, order, axis=0)
+        firsts = bounds[:-1]
+        frames = (poses[:, None] @ cameras.body_T_cam)[state[firsts], camera[firsts]]
         places = np.column_stack([rays[firsts], np.full(len(ids), PRIOR_INVERSE_DEPTH)])
         if len(self._ids):
             at = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
             known = self._ids[at] == ids
             frames[known], places[known] = self._frames[at[known]], self._places[at[known]]
         self._ids, self._frames, self._places = ids, frames, places
-        bounds = np.r_[0, np.cumsum(counts[seen_twice])]
-        structure = Structure(frames, bounds, state[rows], camera[rows], np.ascontiguousarray(rays[rows]))
-        return structure, places, ids
+        return Structure(frames, bounds, state, camera, rays), places, ids
 
     def put(self, ids: Int, frames: Float, places: Float) -> None:
         """Set new frames (L, 4, 4) of landmarks (L,) that were last collected, and their places (L, 3) there."""

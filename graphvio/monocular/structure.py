@@ -51,7 +51,8 @@ class Structure(NamedTuple):
     def of(self, kept: Bool) -> "Structure":
         """Return those of the landmarks (L,) that are kept."""
         rows, begins = rows_of(self.rows, kept)
-        return Structure(self.odom_T_landmark[kept], begins, self.state[rows], self.camera[rows], self.rays[rows])
+        rays = np.compress(rows, self.rays, axis=0)
+        return Structure(self.odom_T_landmark[kept], begins, self.state[rows], self.camera[rows], rays)
 
 
 class Eliminated(NamedTuple):
