@@ -116,8 +116,9 @@ def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Fl
     The change is an unknown of its own, which is eliminated; it has zero mean and, in these units, unit covariance.
     """
     size = len(walk)
+    walk = np.ascontiguousarray(walk[:, walk.any(axis=0)])  # of an exact file, the calibration does not walk
     by_change = product(np.ascontiguousarray(information[:, -size:]), walk)
-    of_change = product(np.ascontiguousarray(walk.T), np.ascontiguousarray(by_change[-size:])) + np.eye(size)
+    of_change = product(np.ascontiguousarray(walk.T), np.ascontiguousarray(by_change[-size:])) + np.eye(walk.shape[1])
     gain = solve_rows(of_change, by_change)
     pull = times(walk.T, gradient[-size:])
     return information - product(gain, np.ascontiguousarray(by_change.T)), gradient - times(gain, pull)
