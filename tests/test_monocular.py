@@ -487,6 +487,23 @@ def test_adjust_from_a_perturbed_window_finds_the_truth_within_its_covariance(sh
     assert np.abs(off[: 6 * 8]).max() < 0.02
 
 
+@pytest.mark.parametrize("calibrates", [False, True])
+@pytest.mark.parametrize("shares", [False, True])
+def test_steps_of_an_adjustment_end_at_the_distance_from_the_solution_that_is_asked_for(
+    shares: bool, calibrates: bool
+) -> None:
+    measured, states, landmarks, prior = problem(8, shares=shares, calibrates=calibrates)
+    file = WindowCalibration(overlapping_rig() if shares else single_rig()).file(np.ones(2)) if calibrates else None
+    solution = adjust(measured, states, landmarks, prior, 40, file, converged=1e-9)
+    information = solution.equations.hessian
+    distances2 = []
+    for converged in (1.0, 0.1, 1e-3):
+        off = adjust(measured, states, landmarks, prior, 40, file, converged).states.since(solution.states)
+        distances2.append(off[: len(information)] @ information @ off[: len(information)])
+        assert distances2[-1] < 3.0 * converged  # the robust cost makes each step a little short
+    assert distances2[0] >= distances2[1] > distances2[2]
+
+
 def test_a_baseline_knows_the_scale_better_than_the_accelerometer() -> None:
     sigmas = []
     for shares in (False, True):

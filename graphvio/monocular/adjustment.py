@@ -27,8 +27,8 @@ from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
 
 ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
-_CONVERGED = 1e-4  # radians, metres, m/s
-_MIN_GAIN = 1e-2  # of the cost, by a step where the calibration is unknown, whose parameters have other units
+_CONVERGED = 1e-3  # of an adjustment that is used once: see `adjust`
+_DAMPING = 1e-8  # at first, as a share of the diagonal; with more, a step does not go all the way to the solution
 _GRAVITY_NORM_SIGMA = 0.02
 ZERO_VELOCITY_SIGMA = 0.01
 
@@ -160,8 +160,18 @@ def adjust(
     prior: Prior | None,
     max_steps: int,
     file: Gaussian | None = None,
+    converged: float = _CONVERGED,
 ) -> Adjusted:
-    """Minimise all errors of a window by Levenberg and Marquardt; arguments are those of `equations`.
+    """Minimise all errors of a window by Levenberg and Marquardt.
+
+    Args:
+        measured: in the window.
+        states: K of them.
+        landmarks: (L, 3).
+        prior: from before the window.
+        max_steps: that are taken.
+        file: as in `equations`.
+        converged: squared distance, in standard deviations, of all unknowns from the solution, at which steps end.
 
     Raises:
         numpy.linalg.LinAlgError: if the equations have no solution.
@@ -169,13 +179,15 @@ def adjust(
     cameras, n = states.cameras(measured.cameras), len(states.poses)
     landmarks = located(states.poses, cameras, landmarks, measured.structure, measured.sigma_px, False)
     at = equations(measured, states, landmarks, prior, file)
-    damping = 1e-8
+    damping = _DAMPING
     for _ in range(max_steps):
         damped, diagonal = at.hessian.copy(), np.diag(at.hessian)
         np.fill_diagonal(damped, diagonal + damping * diagonal)
         step = -solve_symmetric(damped, at.gradient)
         if not np.isfinite(step).all():
             raise np.linalg.LinAlgError("the window's solution is not finite")
+        if damping <= _DAMPING and float(-step @ at.gradient) < converged:
+            break
         moved = states.moved(step)
         of_views = step[visual_columns(n, states.n_camera_parameters, len(step) - 9 * n - GRAVITY - BIASES)]
         shifted, frames = landmarks_after(
@@ -186,11 +198,8 @@ def adjust(
         new = equations(following, moved, shifted, prior, file)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:
-            gained = at.cost - new.cost
             states, landmarks, at, measured = moved, shifted, new, following
             damping = max(0.1 * damping, 1e-9)
-            if np.abs(step).max() < _CONVERGED or (file is not None and gained < _MIN_GAIN):
-                break
         else:
             damping = max(100.0 * damping, 1e-5)
     return Adjusted(states, landmarks, measured, at)

@@ -30,6 +30,7 @@ FIRST_MONOCULAR_SIGMA_PX = 0.3
 _MAX_SIGMA_PX = 0.6
 _NOISE_GAIN = 0.1  # of one keyframe
 _STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
+_CONVERGED = 0.1  # squared distance from the solution, in standard deviations; the next frameset goes on from there
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
@@ -142,10 +143,12 @@ class WindowSolver:
             structure, places, ids = structure.of(others), places[others], ids[others]
         measured = self._measured(window, structure)
         steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
-        adjusted = adjust(measured, window.states, places, prior, steps, calibration.file())
+        adjusted = adjust(measured, window.states, places, prior, steps, calibration.file(), _CONVERGED)
         if is_keyframe and calibration.update_factors(adjusted, window.prior):
             measured, places = adjusted.measured, adjusted.landmarks
-            adjusted = adjust(measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file())
+            adjusted = adjust(
+                measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file(), _CONVERGED
+            )
         window.states = adjusted.states
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
         window.landmarks.put(ids, adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
