@@ -60,7 +60,7 @@ class TrackedFrameset(NamedTuple):
 
 
 class TrackingFrontend(ABC):
-    """Tracks every pair and single camera, in as many threads as cores.
+    """Tracks every pair and single camera, in as many threads as there are cores but one.
 
     Args:
         rig: Stereo pairs and single cameras.
@@ -87,7 +87,8 @@ class TrackingFrontend(ABC):
         self._references = References(config.motion)
         self._standstill = Standstill()
         self._has_rolling_shutter = any(camera.line_time_us for camera in rig.cameras)
-        self._n_threads = min(len(rig.groups), usable_cores())  # with more, they wait for each other
+        # One core is left to what else there is to do, such as to decode. Threads without one wait for each other.
+        self._n_threads = max(1, min(len(rig.groups), usable_cores() - 1))
         self._workers = ThreadPoolExecutor(self._n_threads, thread_name_prefix="graphvio-pair")
 
     def process(
@@ -210,7 +211,7 @@ class TrackingFrontend(ABC):
         return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
 
     def _in_parallel(self, work: Callable[[int], _Result], groups: Iterable[int]) -> dict[int, _Result]:
-        """Work on each pair and single camera, in as many threads as cores, each of which takes the next one."""
+        """Work on each pair and single camera, in several threads, each of which takes the next one."""
         remaining = iter(sorted(groups))
 
         def work_on_next() -> dict[int, _Result]:
