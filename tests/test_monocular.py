@@ -35,6 +35,7 @@ from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.estimator import MonocularEstimator
+from graphvio.monocular.held_landmarks import HeldLandmarks
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
@@ -549,7 +550,7 @@ def test_landmarks_that_are_held_between_keyframes_say_the_same_as_when_solved_f
     n = len(states.poses)
     held = measured.structure.state[measured.structure.rows[1:] - 1] < n - 1
     assert 0.2 < held.mean() < 0.8
-    kept = with_landmarks(
+    kept, _ = with_landmarks(
         measured._replace(structure=measured.structure.of(held)), states.of(np.arange(n - 1)), landmarks[held], prior,
         calibrates,
     )  # fmt: skip
@@ -563,6 +564,30 @@ def test_landmarks_that_are_held_between_keyframes_say_the_same_as_when_solved_f
     off = part.states.since(whole.states)[: len(sigmas)]
     assert np.abs(off / sigmas).max() < 0.02
     np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(part.equations.hessian))), sigmas, rtol=2e-3)
+
+
+@pytest.mark.parametrize("calibrates", [False, True])
+def test_landmarks_that_were_held_move_along_with_the_keyframes_to_where_they_are_best(calibrates: bool) -> None:
+    measured, states, landmarks, prior = problem(14, shares=True, calibrates=calibrates)
+    file = WindowCalibration(overlapping_rig()).file(np.ones(2)) if calibrates else None
+    states, landmarks, measured, _ = adjust(measured, states, landmarks, prior, 12, file)
+    kept, eliminated = with_landmarks(measured, states, landmarks, prior, calibrates)
+    held = HeldLandmarks(np.arange(len(landmarks)), measured, landmarks, kept, eliminated)
+    step = 2e-3 * np.random.default_rng(0).normal(size=9 * 14 + 9 + (len(states.calibration) if calibrates else 0))
+    changed = states.moved(step)
+    cameras = changed.cameras(measured.cameras)
+
+    def error2(frames: Float, places: Float, at_best: bool) -> float:
+        structure = measured.structure._replace(odom_T_landmark=frames)
+        for _ in range(10 if at_best else 0):
+            places = located(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
+        none = Eliminated.empty(structure)
+        return float(visual_equations(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, 1e4, none)[3].sum())
+
+    frames, places = held.moved_along(changed)
+    stays = error2(measured.structure.odom_T_landmark, landmarks, False)
+    best = error2(frames, places, True)
+    assert error2(frames, places, False) < best + 0.02 * (stays - best)
 
 
 def prior_between_poses(rng: np.random.Generator) -> tuple[States, Prior, Float]:

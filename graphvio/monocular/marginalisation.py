@@ -41,7 +41,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         numpy.linalg.LinAlgError: if nothing determines the first state.
     """
     n, n_camera_parameters, n_free = len(states.poses), states.n_camera_parameters, len(states.calibration)
-    hessian, gradient = _linearised(measured, states, landmarks, prior, n_free)
+    hessian, gradient, _ = _linearised(measured, states, landmarks, prior, n_free)
     if n > 1:
         two = states.of(np.arange(2))
         first = measured.samples._replace(keyframes_ns=measured.samples.keyframes_ns[:2])
@@ -66,7 +66,7 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
 
 def with_landmarks(
     measured: Measurements, states: States, landmarks: Float, prior: Prior | None, calibrates: bool
-) -> Prior:
+) -> tuple[Prior, Eliminated]:
     """Add what some landmarks say of the states of a window to what is known from before, linearised at these states.
 
     Args:
@@ -75,9 +75,13 @@ def with_landmarks(
         landmarks: (L, 3).
         prior: from before.
         calibrates: whether the calibration is unknown.
+
+    Returns:
+        What is known then, and what moves these landmarks along with the states.
     """
     n_free = len(states.calibration) if calibrates else 0
-    return Prior(states, *_linearised(measured, states, landmarks, prior, n_free))
+    hessian, gradient, eliminated = _linearised(measured, states, landmarks, prior, n_free)
+    return Prior(states, hessian, gradient), eliminated
 
 
 def first_window(prior: Prior) -> FirstWindow:
@@ -92,7 +96,7 @@ def first_window(prior: Prior) -> FirstWindow:
 
 def _linearised(
     measured: Measurements, states: States, landmarks: Float, prior: Prior | None, n_free: int
-) -> tuple[Float, Float]:
+) -> tuple[Float, Float, Eliminated]:
     """Linearise views and prior; the calibration's parameters, F of them or none, are unknown."""
     n, n_camera_parameters = len(states.poses), states.n_camera_parameters
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
@@ -107,7 +111,7 @@ def _linearised(
     gradient[of_views] += visual_gradient
     if prior is not None:
         add_prior(prior, states, n_free, hessian, gradient)
-    return hessian, gradient
+    return hessian, gradient, eliminated
 
 
 def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Float]:

@@ -16,12 +16,13 @@ from graphvio.measurements.motion import LocatedPoints
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, covariance_of, views_only
 from graphvio.monocular.calibration import WindowCalibration, time_offset_s
+from graphvio.monocular.held_landmarks import HeldLandmarks
 from graphvio.monocular.marginalisation import first_window, with_landmarks, without_first
 from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
-from graphvio.monocular.states import Prior, States
+from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 from graphvio.self_calibration.pixel_noise import pixel_noise
@@ -51,25 +52,6 @@ class Solution(NamedTuple):
     dropped: Mapping[int, Int]
 
 
-class _Held(NamedTuple):
-    """Landmarks that the newest keyframe does not see: until the next one, what they say stays as it was linearised.
-
-    They are three quarters of all, and what they say of the keyframes hardly changes.
-
-    Attributes:
-        ids: of the landmarks.
-        prior: what they say of the keyframes, with what is known from before.
-    """
-
-    ids: Int
-    prior: Prior
-
-    def holds(self, window: KeyframeWindow) -> bool:
-        """Return whether a window has the same keyframes, and a newest state that sees none of the landmarks."""
-        are_same = np.array_equal(window.states.stamps_ns[:-1], self.prior.at.stamps_ns)
-        return are_same and not np.isin(self.ids, window.views[-1].landmark).any()
-
-
 class WindowSolver:
     """Solver of a rig's windows, one after the other.
 
@@ -93,7 +75,7 @@ class WindowSolver:
         self._cameras = cameras
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
-        self._held: _Held | None = None
+        self._held: HeldLandmarks | None = None
         self._may_hold = False  # whether the state before the newest one is a keyframe that was solved for
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
@@ -135,24 +117,19 @@ class WindowSolver:
         Raises:
             numpy.linalg.LinAlgError: if the measurements do not determine them.
         """
-        calibration, prior = self.calibration, window.prior
-        held = None if is_keyframe else self._held_landmarks(window)
-        structure, places, ids = self._structure(window)
-        if held is not None:
-            prior, others = held.prior, ~np.isin(ids, held.ids)
-            structure, places, ids = structure.of(others), places[others], ids[others]
-        measured = self._measured(window, structure)
-        steps = _KEYFRAME_STEPS if is_keyframe else _STEPS
-        adjusted = adjust(measured, window.states, places, prior, steps, calibration.file(), _CONVERGED)
+        calibration, held = self.calibration, self._held_landmarks(window, is_keyframe)
+        adjusted, ids = self._adjusted(window, held, _KEYFRAME_STEPS if is_keyframe else _STEPS)
+        if is_keyframe and held is not None:
+            window.landmarks.put(held.ids, *held.moved_along(adjusted.states))
+            adjusted, ids = self._adjusted(window, None, _KEYFRAME_STEPS)
         if is_keyframe and calibration.update_factors(adjusted, window.prior):
-            measured, places = adjusted.measured, adjusted.landmarks
             adjusted = adjust(
-                measured, adjusted.states, places, window.prior, _RECALIBRATION_STEPS, calibration.file(), _CONVERGED
-            )
-        window.states = adjusted.states
+                adjusted.measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS,
+                calibration.file(), _CONVERGED,
+            )  # fmt: skip
+            _put(adjusted, window, ids)
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
-        window.landmarks.put(ids, adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
-        is_tracking, dropped = self._leave_out_moving(window, structure, ids, adjusted.equations.errors2)
+        is_tracking, dropped = self._leave_out_moving(window, adjusted, ids)
         self._solved = Solved(adjusted, ids, window.views[-1])
         self.covariance = _newest_covariance(adjusted)
         if is_keyframe:
@@ -178,6 +155,18 @@ class WindowSolver:
 
     # ------------------------------------------------------------------ parts of these steps
 
+    def _adjusted(self, window: KeyframeWindow, held: HeldLandmarks | None, max_steps: int) -> tuple[Adjusted, Int]:
+        """Adjust a window by all landmarks but those that are held, and return the identities (L,) of these others."""
+        structure, places, ids = self._structure(window)
+        prior = window.prior
+        if held is not None:
+            prior, others = held.prior, ~np.isin(ids, held.ids)
+            structure, places, ids = structure.of(others), places[others], ids[others]
+        measured = self._measured(window, structure)
+        adjusted = adjust(measured, window.states, places, prior, max_steps, self.calibration.file(), _CONVERGED)
+        _put(adjusted, window, ids)
+        return adjusted, ids
+
     def _structure(self, window: KeyframeWindow) -> tuple[Structure, Float, Int]:
         """Return the window's landmarks, where they are (L, 3), and their identities (L,)."""
         states = window.states
@@ -187,27 +176,27 @@ class WindowSolver:
         samples = self.samples.between(window.states.stamps_ns, self.calibration.is_file_exact)
         return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
 
-    def _held_landmarks(self, window: KeyframeWindow) -> _Held | None:
+    def _held_landmarks(self, window: KeyframeWindow, is_keyframe: bool) -> HeldLandmarks | None:
         """Return the landmarks that are held since the newest keyframe, or None where they have to be solved for.
 
         They are linearised at the first frameset after the keyframe, and not at all where that is one, too.
         """
-        if self._may_hold:
+        if self._may_hold and not is_keyframe:
             self._held, self._may_hold = self._hold(window.without_newest()), False
         return self._held if self._held is not None and self._held.holds(window) else None
 
-    def _hold(self, window: KeyframeWindow) -> _Held:
+    def _hold(self, window: KeyframeWindow) -> HeldLandmarks:
         """Linearise what a keyframe's window knows by landmarks that the keyframe does not see."""
         structure, places, ids = self._structure(window)
         held = ~np.isin(ids, window.views[-1].landmark)
-        measured = self._measured(window, structure.of(held))
+        ids, places, measured = ids[held], places[held], self._measured(window, structure.of(held))
         calibrates = self.calibration.file() is not None
-        return _Held(ids[held], with_landmarks(measured, window.states, places[held], window.prior, calibrates))
+        prior, eliminated = with_landmarks(measured, window.states, places, window.prior, calibrates)
+        return HeldLandmarks(ids, measured, places, prior, eliminated)
 
-    def _leave_out_moving(
-        self, window: KeyframeWindow, structure: Structure, ids: Int, errors2: Float
-    ) -> tuple[bool, Mapping[int, Int]]:
+    def _leave_out_moving(self, window: KeyframeWindow, adjusted: Adjusted, ids: Int) -> tuple[bool, Mapping[int, Int]]:
         """End landmarks that do not stand still: whether enough others are seen, and which tracks these were."""
+        structure, errors2 = adjusted.measured.structure, adjusted.equations.errors2
         off = far_off(structure, errors2, MAX_ERROR2, MAX_OFF)
         seen = np.isin(ids, window.views[-1].landmark)
         is_tracking = int((seen & ~off).sum()) >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
@@ -256,6 +245,12 @@ class WindowSolver:
         self._on_views(
             WindowViews(states.stamps_ns[kept], states.poses[kept], information[np.ix_(rows, rows)], gradient[rows])
         )
+
+
+def _put(adjusted: Adjusted, window: KeyframeWindow, ids: Int) -> None:
+    """Put adjusted states, and landmarks by their identities (L,), into a window."""
+    window.states = adjusted.states
+    window.landmarks.put(ids, adjusted.measured.structure.odom_T_landmark, adjusted.landmarks)
 
 
 def newest_state(states: States) -> RigState:

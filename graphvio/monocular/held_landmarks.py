@@ -1,0 +1,49 @@
+"""Landmarks that are not solved for between keyframes: what they say of these stays as it was linearised."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.monocular.adjustment import Measurements
+from graphvio.monocular.states import Prior, States, visual_columns
+from graphvio.monocular.structure import Eliminated, landmarks_after
+from graphvio.monocular.window import KeyframeWindow
+
+
+class HeldLandmarks(NamedTuple):
+    """Landmarks that the newest keyframe does not see: until the next one, what they say stays as it was linearised.
+
+    They are three quarters of all, and what they say of the keyframes hardly changes.
+
+    Attributes:
+        ids: (L,) of the landmarks.
+        measured: their views.
+        places: (L, 3).
+        prior: what they say of the keyframes, with what is known from before.
+        eliminated: what moves them along with the keyframes.
+    """
+
+    ids: Int
+    measured: Measurements
+    places: Float
+    prior: Prior
+    eliminated: Eliminated
+
+    def holds(self, window: KeyframeWindow) -> bool:
+        """Return whether a window has the same keyframes, and a newest state that sees none of the landmarks."""
+        are_same = np.array_equal(window.states.stamps_ns[:-1], self.prior.at.stamps_ns)
+        return are_same and not np.isin(self.ids, window.views[-1].landmark).any()
+
+    def moved_along(self, states: States) -> tuple[Float, Float]:
+        """Return the landmarks' frames (L, 4, 4) and places (L, 3) for what the states are taken for now."""
+        then, n_parameters = self.prior.at, self.eliminated.by_cameras.shape[2]
+        now = states.of(np.arange(len(then.poses)))
+        step = now.since(then)[visual_columns(len(then.poses), n_parameters, n_parameters)]
+        places, frames = landmarks_after(
+            self.places, self.measured.structure, then.cameras(self.measured.cameras), then.poses, now.poses,
+            self.eliminated, step,
+        )  # fmt: skip
+        return frames, places
