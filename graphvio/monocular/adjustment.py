@@ -171,8 +171,7 @@ def adjust(
         prior: from before the window.
         max_steps: that are taken.
         file: as in `equations`.
-        converged: squared length, in standard deviations of all unknowns, of the last step; after it the equations are
-            those before, with the gradient that these foretell: none.
+        converged: squared distance, in standard deviations, of all unknowns from the solution, at which steps end.
 
     Raises:
         numpy.linalg.LinAlgError: if the equations have no solution.
@@ -187,6 +186,8 @@ def adjust(
         step = -solve_symmetric(damped, at.gradient)
         if not np.isfinite(step).all():
             raise np.linalg.LinAlgError("the window's solution is not finite")
+        if damping <= _DAMPING and float(-step @ at.gradient) < converged:
+            break
         moved = states.moved(step)
         of_views = step[visual_columns(n, states.n_camera_parameters, len(step) - 9 * n - GRAVITY - BIASES)]
         shifted, frames = landmarks_after(
@@ -194,8 +195,6 @@ def adjust(
             of_views,
         )  # fmt: skip
         following = measured._replace(structure=measured.structure._replace(odom_T_landmark=frames))
-        if damping <= _DAMPING and float(-step @ at.gradient) < converged:  # too short to look at where it leads
-            return Adjusted(moved, shifted, following, at._replace(gradient=np.zeros_like(at.gradient)))
         new = equations(following, moved, shifted, prior, file)
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         if new.cost <= at.cost and not loses_intervals:
