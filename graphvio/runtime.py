@@ -3,8 +3,8 @@
 No object of the library changes the process that it runs in. The command line makes the settings of this module; a
 program that embeds graphvio makes those that suit it:
 
-- `set_up_threads`, since pairs are tracked in threads of their own, with which OpenCV's would compete, and which would
-  wait for each other for milliseconds;
+- `set_up_threads`, since front-end and self-calibration have threads, with which OpenCV's would compete, and which
+  would wait for each other for milliseconds;
 - `limit_blas_threads` before numpy is imported, since BLAS would start threads of its own for matrices of some hundred
   rows;
 - `share_heap` before threads are started, where images pass through many threads for hours;

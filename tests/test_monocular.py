@@ -44,7 +44,7 @@ from graphvio.monocular.states import Prior, States, first_prior
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
-from graphvio.self_calibration.evidence import Evidence
+from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, has_coefficient, moved_cameras
@@ -389,6 +389,12 @@ def problem(
     return Problem(measured, states, places, prior)
 
 
+def wrong_file(shares: bool, calibrates: bool) -> Gaussian | None:
+    """What a file that is as wrong as it says knows of the calibration in `problem`; None where it is exact."""
+    calibration = WindowCalibration(overlapping_rig() if shares else single_rig())
+    return calibration.file(np.ones(2)) if calibrates else None
+
+
 def at_best(measured: Measurements, states: States, landmarks: Float) -> tuple[Float, Float, float]:
     """Return Hessian, gradient and cost of poses and cameras, with the landmarks at their best places."""
     cameras = states.cameras(measured.cameras)
@@ -494,7 +500,7 @@ def test_steps_of_an_adjustment_end_at_the_distance_from_the_solution_that_is_as
     shares: bool, calibrates: bool
 ) -> None:
     measured, states, landmarks, prior = problem(8, shares=shares, calibrates=calibrates)
-    file = WindowCalibration(overlapping_rig() if shares else single_rig()).file(np.ones(2)) if calibrates else None
+    file = wrong_file(shares, calibrates)
     solution = adjust(measured, states, landmarks, prior, 40, file, converged=1e-9)
     information = solution.equations.hessian
     distances2 = []
@@ -517,8 +523,7 @@ def test_a_baseline_knows_the_scale_better_than_the_accelerometer() -> None:
 @pytest.mark.parametrize("shares", [False, True])
 def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool, calibrates: bool) -> None:
     measured, states, landmarks, prior = problem(6, shares=shares, calibrates=calibrates)
-    calibration = WindowCalibration(overlapping_rig() if shares else single_rig())
-    file = calibration.file(np.ones(2)) if calibrates else None
+    file = wrong_file(shares, calibrates)
     adjusted = adjust(measured, states, landmarks, prior, 12, file)
     states, landmarks, measured, _ = adjusted
     n = len(states.poses)
@@ -545,7 +550,7 @@ def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool,
 @pytest.mark.parametrize("calibrates", [False, True])
 def test_landmarks_that_are_held_between_keyframes_say_the_same_as_when_solved_for(calibrates: bool) -> None:
     measured, states, landmarks, prior = problem(14, shares=True, calibrates=calibrates)
-    file = WindowCalibration(overlapping_rig()).file(np.ones(2)) if calibrates else None
+    file = wrong_file(True, calibrates)
     states, landmarks, measured, _ = adjust(measured, states, landmarks, prior, 12, file)
     n = len(states.poses)
     held = measured.structure.state[measured.structure.rows[1:] - 1] < n - 1
@@ -569,7 +574,7 @@ def test_landmarks_that_are_held_between_keyframes_say_the_same_as_when_solved_f
 @pytest.mark.parametrize("calibrates", [False, True])
 def test_landmarks_that_were_held_move_along_with_the_keyframes_to_where_they_are_best(calibrates: bool) -> None:
     measured, states, landmarks, prior = problem(14, shares=True, calibrates=calibrates)
-    file = WindowCalibration(overlapping_rig()).file(np.ones(2)) if calibrates else None
+    file = wrong_file(True, calibrates)
     states, landmarks, measured, _ = adjust(measured, states, landmarks, prior, 12, file)
     kept, eliminated = with_landmarks(measured, states, landmarks, prior, calibrates)
     held = HeldLandmarks(np.arange(len(landmarks)), measured, landmarks, kept, eliminated)

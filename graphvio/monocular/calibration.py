@@ -173,7 +173,7 @@ class WindowCalibration:
             return False
         file = self.file()
         if file is None:
-            is_due = int(adjusted.states.stamps_ns[-1]) - self._latest_ns >= _ESTIMATE_EVERY_NS
+            is_due = self._is_due(int(adjusted.states.stamps_ns[-1]))
             return is_due and self.update(self._evidence_of(adjusted, prior))
         return self.update(evidence_of(adjusted.equations, adjusted.states, file))
 
@@ -182,6 +182,10 @@ class WindowCalibration:
         file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
         at = equations(adjusted.measured, adjusted.states, adjusted.landmarks, prior, file)
         return evidence_of(at, adjusted.states, file)
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        """Whether what is known of all parameters was last noted a second ago."""
+        return stamp_ns - self._latest_ns >= _ESTIMATE_EVERY_NS
 
     def update(self, evidence: Evidence) -> bool:
         """Use what the window and what left it say of the calibration.
@@ -212,7 +216,7 @@ class WindowCalibration:
             states: with the difference that is in force.
             covariance: of the newest state, and of the biases.
         """
-        if not self.size or stamp_ns - self._latest_ns < _ESTIMATE_EVERY_NS:
+        if not self.size or not self._is_due(stamp_ns):
             return
         own = self._evidence.given(self._prior, np.maximum(self.factors, _MIN_FACTOR))
         of_biases = np.zeros((6, 6))

@@ -5,7 +5,6 @@ Where that is wrong by a calibration error, ``rig-true.yaml`` next to it is righ
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from graphvio.errors import SourceError
 from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
+from graphvio.runtime import usable_cores
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
@@ -151,7 +151,7 @@ def write_recording(
             image = simulator.image(index, number, surfaces=surfaces)
             _write_image(mav0 / cameras[number].name / "data" / f"{stamps[index]}.png", image)
 
-    workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = usable_cores()
     write(0)  # compiles the kernels once, before threads would wait for each other
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(_in_order(pool, write, range(1, len(stamps)), 2 * workers), start=2):

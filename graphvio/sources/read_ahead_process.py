@@ -21,7 +21,7 @@ from contextlib import closing, suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from graphvio.runtime import HeldInterrupt, ignore_interrupts
+from graphvio.runtime import HeldInterrupt, ignore_interrupts, usable_cores
 from graphvio.sources.read_ahead import read_ahead
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ _NICENESS = 5  # results are ready ahead of time; who takes them comes first
 
 def can_fork() -> bool:
     """Return whether a process can be forked here and has a core: on Linux, with two of them."""
-    return sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
+    return sys.platform == "linux" and usable_cores() > 1
 
 
 def read_ahead_in_process(
