@@ -76,7 +76,6 @@ class WindowSolver:
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
         self._held: HeldLandmarks | None = None
-        self._may_hold = False  # whether the state before the newest one is a keyframe that was solved for
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
 
@@ -135,7 +134,7 @@ class WindowSolver:
         if is_keyframe:
             calibration.note(stamp_ns, adjusted.states, self.covariance)
             self._finish_keyframe(window, adjusted)
-            self._held, self._may_hold = None, True
+            self._held = None
         return Solution(adjusted.equations.imu_errors2, is_tracking, dropped)
 
     def end(self, window: KeyframeWindow) -> None:
@@ -151,7 +150,7 @@ class WindowSolver:
 
     def forget(self) -> None:
         """Forget what the last window said of the newest state."""
-        self._solved, self._held, self._may_hold, self.covariance = None, None, False, NO_COVARIANCE
+        self._solved, self._held, self.covariance = None, None, NO_COVARIANCE
 
     # ------------------------------------------------------------------ parts of these steps
 
@@ -181,8 +180,8 @@ class WindowSolver:
 
         They are linearised at the first frameset after the keyframe, and not at all where that is one, too.
         """
-        if self._may_hold and not is_keyframe:
-            self._held, self._may_hold = self._hold(window.without_newest()), False
+        if self._held is None and not is_keyframe:
+            self._held = self._hold(window.without_newest())
         return self._held if self._held is not None and self._held.holds(window) else None
 
     def _hold(self, window: KeyframeWindow) -> HeldLandmarks:
