@@ -11,6 +11,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.errors import MeasurementError
+from graphvio.geometry import so3_exp, so3_log
 from graphvio.kernels import kernel, put
 from graphvio.self_calibration.imu_model import (
     ACCEL_MATRIX,
@@ -44,6 +45,9 @@ class Preintegrated(NamedTuple):
         position: (3,) m.
         jacobian: (9, 25) derivative with respect to the parameters.
         covariance: (9, 9) of the samples' white noise.
+        force_variances: (3,) of velocity, of position with velocity, and of position, by the accelerometer's noise
+            without its matrix.
+        middle_rotation: (3, 3) ``start_R_body`` in the middle of the interval.
         duration_s: of the interval.
     """
 
@@ -52,6 +56,8 @@ class Preintegrated(NamedTuple):
     position: Float
     jacobian: Float
     covariance: Float
+    force_variances: Float
+    middle_rotation: Float
     duration_s: float
 
 
@@ -128,7 +134,7 @@ def integrate_samples(
     start_force, middle_force, end_force = np.empty(3), np.empty(3), np.empty(3)  # in the frame of the interval's start
     half_turn, turn = np.empty(3), np.empty(3)
     sums = np.zeros((5, 4, 3, 3))
-    spread, levers = np.zeros((3, 3, 3)), np.zeros((2, 3))
+    spread, levers, of_force = np.zeros((3, 3, 3)), np.zeros((2, 3)), np.zeros(3)
     turned_s, is_first = 0.0, True
     slope_at(stamps_ns, readings, first, left_slope)
     for i in range(first, last):
@@ -164,7 +170,7 @@ def integrate_samples(
                 position[c] += h * velocity[c] + h * h / 6.0 * (start_force[c] + 2.0 * middle_force[c])
                 velocity[c] += h / 6.0 * (start_force[c] + 4.0 * middle_force[c] + end_force[c])
             add_derivatives(h, middle_rotation, middle_force, raw_middle, sums)
-            add_noise(h, middle_force, turned_s, noise_densities, noise_factors[i], levers, spread)
+            add_noise(h, middle_force, turned_s, noise_densities, noise_factors[i], levers, spread, of_force)
             turned_s += h * noise_factors[i, 0]
             put(rotation, end_rotation)
             put(start_force, end_force)
@@ -173,8 +179,10 @@ def integrate_samples(
     jacobian = np.zeros((9, PARAMETERS))
     fill_parameter_columns(rotation, gyro_matrix, accel_matrix, sums, jacobian)
     fill_time_offset_column(rotation, velocity, position, duration_s, very_start, at_end, end_force, jacobian)
-    covariance = covariance_of(rotation, turned_s * noise_densities[0] ** 2, levers, spread)
-    return Preintegrated(rotation, velocity, position, jacobian, covariance, duration_s)
+    middle = so3_exp(0.5 * so3_log(rotation))
+    turn = turned_s * noise_densities[0] ** 2
+    covariance = covariance_of(rotation, turn, levers, spread, of_force, middle @ accel_matrix)
+    return Preintegrated(rotation, velocity, position, jacobian, covariance, of_force, middle, duration_s)
 
 
 @kernel

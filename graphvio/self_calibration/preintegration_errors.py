@@ -97,8 +97,9 @@ def fill_time_offset_column(
 
 @kernel
 def add_noise(
-    h: float, force: Float, turned_s: float, noise_densities: Float, noise_factors: Float, levers: Float, spread: Float
-) -> None:
+    h: float, force: Float, turned_s: float, noise_densities: Float, noise_factors: Float, levers: Float,
+    spread: Float, of_force: Float,
+) -> None:  # fmt: skip
     """Propagate the covariance over a step, frame of the interval's start.
 
     The rotation's covariance is a multiple of I there. Those of velocity and position with it are cross products,
@@ -111,7 +112,8 @@ def add_noise(
         noise_densities: (2,) of gyro and accelerometer.
         noise_factors: (2,) by which their variances in this step are larger.
         levers: (2, 3) of velocity and position.
-        spread: (3, 3, 3) covariances of velocity, of position with velocity, and of position.
+        spread: (3, 3, 3) covariances of velocity, of position with velocity, and of position, by the gyro's noise.
+        of_force: (3,) the same variances by the accelerometer's, which is the same in all directions.
     """
     turn = noise_densities[0] ** 2 * (turned_s + 0.5 * h * noise_factors[0])
     noise = noise_densities[1] ** 2 * h * noise_factors[1]
@@ -142,17 +144,31 @@ def add_noise(
             position[r, c] -= (
                 0.5 * h * h * (force[r] * (later_c - less * force[c]) + (later_r - less * force[r]) * force[c])
             )
-        velocity[r, r] += by_velocity + noise
-        mixed[r, r] += by_mixed + 0.5 * h * noise
-        position[r, r] += by_position + h * h * noise / 3.0
+        velocity[r, r] += by_velocity
+        mixed[r, r] += by_mixed
+        position[r, r] += by_position
+    of_force[2] += h * (2.0 * of_force[1] + h * (of_force[0] + noise / 3.0))
+    of_force[1] += h * (of_force[0] + 0.5 * noise)
+    of_force[0] += noise
     for k in range(3):
         of_position[k] += h * of_velocity[k] + 0.5 * h * h * turn * force[k]
         of_velocity[k] += h * turn * force[k]
 
 
 @kernel
-def covariance_of(rotation: Float, turn: float, levers: Float, spread: Float) -> Float:
-    """Return the covariance (9, 9) from the parts of `add_noise`."""
+def covariance_of(
+    rotation: Float, turn: float, levers: Float, spread: Float, of_force: Float, force_axes: Float
+) -> Float:
+    """Return the covariance (9, 9) from the parts of `add_noise`.
+
+    Args:
+        rotation: (3, 3) of the interval.
+        turn: variance of the rotation.
+        levers: of `add_noise`, and the next two.
+        spread: likewise.
+        of_force: likewise, of readings as they are.
+        force_axes: (3, 3) the accelerometer's axes in the middle of the interval, by its matrix.
+    """
     covariance = np.zeros((9, 9))
     for r in range(3):
         covariance[r, r] = turn
@@ -160,6 +176,15 @@ def covariance_of(rotation: Float, turn: float, levers: Float, spread: Float) ->
             covariance[3 + r, 3 + c] = spread[0, r, c]
             covariance[6 + r, 3 + c] = covariance[3 + c, 6 + r] = spread[1, r, c]
             covariance[6 + r, 6 + c] = spread[2, r, c]
+    for r in range(3):
+        for c in range(3):
+            by_axes = 0.0
+            for k in range(3):
+                by_axes += force_axes[r, k] * force_axes[c, k]
+            covariance[3 + r, 3 + c] += of_force[0] * by_axes
+            covariance[6 + r, 3 + c] += of_force[1] * by_axes
+            covariance[3 + r, 6 + c] += of_force[1] * by_axes
+            covariance[6 + r, 6 + c] += of_force[2] * by_axes
     for part in range(2):
         x, y, z = levers[part]
         for c in range(3):
