@@ -164,3 +164,8 @@ def eigen(matrix: Float) -> tuple[Float, Float]:
                     a, b = turned[p, k], turned[q, k]
                     turned[p, k], turned[q, k] = cosine * a - sine * b, sine * a + cosine * b
     return np.diag(turned).copy(), axes
+
+
+def times(matrix: Float, vector: Float) -> Float:
+    """Multiply in a fixed order: a library's last digits depend on where arrays lie in memory."""
+    return product(np.ascontiguousarray(matrix), vector.reshape(-1, 1))[:, 0]

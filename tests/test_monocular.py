@@ -30,7 +30,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.motion import CameraTracks, CrossCameraMatches, HandedOverTracks
 from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
-from graphvio.monocular.adjustment import Measurements, add_prior, adjust, covariance_of, equations, scale_sigma
+from graphvio.monocular.adjustment import Measurements, adjust, covariance_of, equations, scale_sigma
 from graphvio.monocular.calibration import WindowCalibration
 from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.equations import visual_equations
@@ -40,8 +40,9 @@ from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
-from graphvio.monocular.states import Prior, States, first_prior
+from graphvio.monocular.states import States
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
+from graphvio.monocular.window_prior import Prior, add_prior, first_prior
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.self_calibration.evidence import Evidence, Gaussian
@@ -624,11 +625,35 @@ def test_the_equations_of_a_prior_are_the_derivatives_of_its_cost(seed: int) -> 
     np.testing.assert_allclose(gradient, numeric, atol=1e-5 * np.abs(gradient).max())
     by_step = np.array(
         [
-            turned.moved(1e-6 * e).since(prior.at) - turned.moved(-1e-6 * e).since(prior.at)
+            prior.difference(turned.moved(1e-6 * e)).off - prior.difference(turned.moved(-1e-6 * e)).off
             for e in np.eye(36)
         ]
     ).T / 2e-6  # fmt: skip
     np.testing.assert_allclose(hessian, by_step.T @ prior.information @ by_step, atol=1e-6 * np.abs(hessian).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_prior_that_knows_no_scale_does_not_pull_at_it_when_the_poses_move(seed: int) -> None:
+    states, prior, step = prior_between_poses(np.random.default_rng(seed))
+
+    def along_scale(at: States) -> Float:
+        grown: Float = np.zeros(36)
+        for k in range(3):
+            grown[6 * k + 3 : 6 * k + 6] = at.poses[k, :3, :3].T @ at.poses[k, :3, 3]
+        grown[18:27] = at.velocities.ravel()
+        return grown
+
+    scale = along_scale(states)
+    others = np.eye(36) - np.outer(scale, scale) / (scale @ scale)
+    prior = prior._replace(information=others @ prior.information @ others)
+    step[:6] = step[18:21] = 0.0
+    moved = states.moved(step)
+    hessian, gradient, plain = np.zeros((36, 36)), np.zeros(36), prior.information @ moved.since(states)
+    add_prior(prior, moved, 0, hessian, gradient)
+    now = along_scale(moved)
+    assert plain @ now > 1e3  # which a smaller scale makes less
+    assert abs(gradient @ now) < 0.01 * (plain @ now)
+    assert now @ hessian @ now < 0.01 * (now @ prior.information @ now)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -7,22 +7,20 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.linear_algebra import cholesky, product, solve_lower, solve_rows, solve_symmetric
+from graphvio.linear_algebra import cholesky, product, solve_lower, solve_rows, solve_symmetric, times
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.states import (
     BIASES,
     GRAVITY,
-    Prior,
     States,
     add_block,
-    columns_of,
     inertial_columns,
-    of_perturbations,
     visual_columns,
 )
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
+from graphvio.monocular.window_prior import Prior, add_prior
 from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
 
@@ -129,28 +127,6 @@ def equations(
         gradient[known:] += pull
         cost += 0.5 * float((away * pull).sum())
     return Equations(hessian, gradient, cost, errors2, inertial.errors2, eliminated)
-
-
-def add_prior(prior: Prior, states: States, n_free: int, hessian: Float, gradient: Float) -> float:
-    """Add what is known from before a window to its equations, and return its cost.
-
-    Args:
-        prior: of the first states.
-        states: all of the window, at which the equations are.
-        n_free: number of the calibration's parameters that are unknown, F or 0.
-        hessian: is added to.
-        gradient: is added to.
-    """
-    first = np.arange(len(prior.at.poses))
-    off = states.of(first).since(prior.at)
-    pull = times(prior.information, off)
-    columns = columns_of(len(states.poses), first, n_free)
-    information, total = of_perturbations(
-        prior.information, prior.gradient + pull, states.poses[: len(first)], prior.at.poses
-    )
-    add_block(hessian, columns, information)
-    gradient[columns] += total[: len(columns)]
-    return float((prior.gradient * off + 0.5 * off * pull).sum())
 
 
 def adjust(
@@ -271,8 +247,3 @@ def scale_sigma(states: States, hessian: Float) -> float:
     size2 = float((centred**2).sum())
     covariance = covariance_of(hessian, np.arange(6 * n))
     return float(np.sqrt(along @ covariance @ along)) / max(size2, 1e-12)
-
-
-def times(matrix: Float, vector: Float) -> Float:
-    """Multiply in a fixed order: a library's last digits depend on where arrays lie in memory."""
-    return product(np.ascontiguousarray(matrix), vector.reshape(-1, 1))[:, 0]

@@ -13,7 +13,8 @@ from graphvio.arrays import Float
 from graphvio.backend.states import StateCovariance
 from graphvio.linear_algebra import cholesky, solve_rows
 from graphvio.monocular.adjustment import Adjusted, equations, evidence_of
-from graphvio.monocular.states import Prior, States
+from graphvio.monocular.states import States
+from graphvio.monocular.window_prior import Prior
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import (

@@ -8,9 +8,10 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.monocular.adjustment import Measurements
-from graphvio.monocular.states import Prior, States, visual_columns
+from graphvio.monocular.states import States, visual_columns
 from graphvio.monocular.structure import Eliminated, landmarks_after
 from graphvio.monocular.window import KeyframeWindow
+from graphvio.monocular.window_prior import Prior
 
 
 class HeldLandmarks(NamedTuple):

@@ -25,9 +25,10 @@ from graphvio.monocular.closed_form import first_guess
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
 from graphvio.monocular.sightings import LandmarkIds, Landmarks, Views, far_off
-from graphvio.monocular.states import Prior, States, first_prior, size_m
+from graphvio.monocular.states import States, size_m
 from graphvio.monocular.structure import located
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
+from graphvio.monocular.window_prior import Prior, first_prior
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
 

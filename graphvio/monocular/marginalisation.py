@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.linear_algebra import product, solve_rows
+from graphvio.linear_algebra import product, solve_rows, times
 from graphvio.measurements.window_views import FirstWindow
-from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements, add_prior, times
+from graphvio.monocular.adjustment import ROBUST_SCALE, ZERO_VELOCITY_SIGMA, Measurements
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.states import (
     BIASES,
     GRAVITY,
-    Prior,
     States,
     add_block,
     columns_of,
@@ -20,6 +19,7 @@ from graphvio.monocular.states import (
     visual_columns,
 )
 from graphvio.monocular.structure import Eliminated
+from graphvio.monocular.window_prior import Prior, add_prior
 from graphvio.self_calibration.inertial import InertialStates, inertial_equations
 
 

@@ -1,4 +1,4 @@
-"""States of a window and what is known of them from before, and where their unknowns are in a window's equations.
+"""States of a window, and where their unknowns are in a window's equations.
 
 Unknowns are ``[poses 6 K, velocities 3 K, gravity 3, gyro and accelerometer bias 6, calibration F]`` of K states; the
 landmarks are eliminated. Biases and calibration are the same in the whole window; they walk when a state leaves it. The
@@ -9,14 +9,12 @@ difference from the rig file, which is unknown, or taken for zero.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.geometry import so3_exp, so3_log, so3_right_jacobian_inverse
+from graphvio.geometry import so3_exp, so3_log
 from graphvio.kernels import kernel
-from graphvio.linear_algebra import turn_rows
 from graphvio.monocular.reprojection import Cameras
 from graphvio.self_calibration.imu_model import PARAMETERS
 
@@ -95,27 +93,6 @@ class States:
         return difference
 
 
-class Prior(NamedTuple):
-    """What is known of the first states of a window, of gravity, of the biases, and by them of the calibration.
-
-    Attributes:
-        at: the m states at which it was linearised.
-        information: (9 m + 9 + F, 9 m + 9 + F).
-        gradient: (9 m + 9 + F,) of the cost at these.
-    """
-
-    at: States
-    information: Float
-    gradient: Float
-
-
-def first_prior(states: States, bias_sigmas: Float, biases: Float, pose_sigmas: Float) -> Prior:
-    """Return what is known of a window's first state: its pose defines the frame; and of the biases."""
-    first, calibration = replace(states.of(np.arange(1)), biases=biases), np.zeros(len(states.calibration))
-    information = np.diag(np.concatenate([1.0 / pose_sigmas**2, np.zeros(6), 1.0 / bias_sigmas**2, calibration]))
-    return Prior(first, information, np.zeros(len(information)))
-
-
 def columns_of(n: int, states: Int, n_free: int = 0) -> Int:
     """Return where ``[poses, velocities, gravity, biases, calibration]`` of some of n states are among all unknowns."""
     poses = (6 * states[:, None] + np.arange(6)).ravel()
@@ -141,30 +118,6 @@ def add_block(hessian: Float, columns: Int, block: Float) -> None:
     for r in range(len(columns)):
         for c in range(len(columns)):
             hessian[columns[r], columns[c]] += block[r, c]
-
-
-@kernel
-def of_perturbations(information: Float, gradient: Float, poses: Float, before: Float) -> tuple[Float, Float]:
-    """Return the information and gradient of perturbed poses, from those of their differences as by `States.since`.
-
-    A perturbation is in the body's axes as they are now, and a difference in those of before. Where the two are taken
-    for the same, a prior pretends to know where the whole window is, and which way it faces, once poses have turned.
-
-    Args:
-        information: (N, N) of all unknowns, the poses first.
-        gradient: (N,).
-        poses: (K, 4, 4) that are perturbed.
-        before: (K, 4, 4) from which the differences are.
-    """
-    changed, total = information.copy(), gradient.copy().reshape(-1, 1)
-    for k in range(len(poses)):
-        before_R_now = before[k, :3, :3].T.copy() @ poses[k, :3, :3].copy()
-        by_rotation = so3_right_jacobian_inverse(so3_log(before_R_now))
-        for at, by in ((6 * k, by_rotation), (6 * k + 3, before_R_now)):
-            turn_rows(by, at, changed)
-            turn_rows(by, at, changed.T)
-            turn_rows(by, at, total)
-    return changed, total[:, 0]
 
 
 def size_m(positions: Float) -> float:

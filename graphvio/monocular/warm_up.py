@@ -10,8 +10,9 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import Measurements, adjust, covariance_of
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.reprojection import Cameras
-from graphvio.monocular.states import States, first_prior
+from graphvio.monocular.states import States
 from graphvio.monocular.structure import Structure, located
+from graphvio.monocular.window_prior import first_prior
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples

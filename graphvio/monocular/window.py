@@ -10,7 +10,8 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.sightings import LandmarkIds, Landmarks, Views
-from graphvio.monocular.states import Prior, States
+from graphvio.monocular.states import States
+from graphvio.monocular.window_prior import Prior
 
 MAX_KEYFRAMES = 14
 MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still

@@ -256,9 +256,15 @@ def _take_noise(
         whitener: (9, 9) of it.
         jacobian: (9, 46) is changed.
     """
-    whitened = whitener @ error
-    share = _MAX_NOISE2 / max(float(whitened @ whitened), _MAX_NOISE2)
-    weighed = share * (whitener.T @ whitened)
+    weighed, error2 = np.zeros(9), 0.0
+    for r in range(9):
+        whitened = 0.0
+        for k in range(r + 1):
+            whitened += whitener[r, k] * error[k]
+        error2 += whitened * whitened
+        for k in range(r + 1):
+            weighed[k] += whitener[r, k] * whitened
+    weighed *= _MAX_NOISE2 / max(error2, _MAX_NOISE2)
     middle, (of_velocity, of_both, of_position) = preintegrated.middle_rotation, preintegrated.force_variances
     axes = middle @ sensor_matrix(parameters, ACCEL_MATRIX)
     for c in range(3):
