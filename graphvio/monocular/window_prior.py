@@ -1,9 +1,11 @@
 """What is known from before a window: of its first states, of gravity, of the biases, and of the calibration.
 
-A prior stays as it was linearised, with errors in metres. Those of what cameras see shrink with the scale, but pixels
-do not: each difference that a prior held would make a smaller scale likelier, and one that vision does not know would
-shrink with time. So states are compared at the same size of the window, and the size by itself, along what was known:
-with the first derivatives of the plain difference, but exact for windows that differ in nothing but their scale.
+A prior stays as it was linearised, with errors in metres. Those of what cameras see get smaller with the scale, while
+errors in pixels do not: each correction of a pose would make a smaller scale likelier, and a scale that vision does not
+know would shrink with time. So states are compared at the same size of the window, and the size by itself, by its
+logarithm, as differences in Sim(3) are (H. Strasdat, J. Montiel, A. Davison, *Scale Drift-Aware Large Scale Monocular
+SLAM*, RSS 2010). To first order that is the plain difference; between windows that differ in their scale only, it is
+exact.
 """
 
 from __future__ import annotations
@@ -79,7 +81,7 @@ def add_prior(prior: Prior, states: States, n_free: int, hessian: Float, gradien
     first = np.arange(len(prior.at.poses))
     difference = prior.difference(states.of(first))
     pull = times(prior.information, difference.off)
-    information, total = _of_plain(prior.information, prior.gradient + pull, difference)
+    information, total = _of_plain_differences(prior.information, prior.gradient + pull, difference)
     information, total = of_perturbations(information, total, states.poses[: len(first)], prior.at.poses)
     columns = columns_of(len(states.poses), first, n_free)
     add_block(hessian, columns, information)
@@ -134,7 +136,7 @@ def _at_same_size(
 
 
 @kernel
-def _of_plain(information: Float, gradient: Float, difference: Difference) -> tuple[Float, Float]:
+def _of_plain_differences(information: Float, gradient: Float, difference: Difference) -> tuple[Float, Float]:
     """Return information (N, N) and gradient (N,) of plain differences, from those of a `Difference`."""
     scaled, away, by_size = difference.scaled, difference.away, difference.by_size
     weighed = np.zeros(len(away))
