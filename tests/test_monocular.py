@@ -42,6 +42,7 @@ from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import States
 from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
+from graphvio.monocular.window import MAX_ERROR2
 from graphvio.monocular.window_prior import Prior, add_prior, first_prior
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
@@ -594,6 +595,18 @@ def test_landmarks_that_were_held_move_along_with_the_keyframes_to_where_they_ar
     stays = error2(measured.structure.odom_T_landmark, landmarks, False)
     best = error2(frames, places, True)
     assert error2(frames, places, False) < best + 0.02 * (stays - best)
+
+
+def test_a_landmark_of_impossible_inverse_depth_says_nothing_of_the_poses() -> None:
+    measured, states, landmarks, prior = problem(is_exact=True)
+    others = np.arange(len(landmarks)) > 0
+    without = equations(measured._replace(structure=measured.structure.of(others)), states, landmarks[others], prior)
+    for inverse_depth in (-243.0, 60.0):
+        wrong = landmarks.copy()
+        wrong[0, 2] = inverse_depth
+        at = equations(measured, states, wrong, prior)
+        np.testing.assert_allclose(at.hessian, without.hessian, rtol=1e-9, atol=1e-9 * np.abs(without.hessian).max())
+        assert (at.errors2[: measured.structure.rows[1]] > MAX_ERROR2).all()
 
 
 def prior_between_poses(rng: np.random.Generator) -> tuple[States, Prior, Float]:

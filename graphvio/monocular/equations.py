@@ -27,6 +27,7 @@ from graphvio.self_calibration.bundle import inverse3
 from graphvio.self_calibration.parameters import CAMERA, SINGLE
 
 _ERROR2_BEHIND = 1e6  # of a landmark behind the camera
+_MAX_INVERSE_DEPTH = 10.0  # as wide as the prior: a mismatch, which would hold poses by its nearness
 
 
 class _Sums(NamedTuple):
@@ -103,9 +104,10 @@ def visual_equations(
         away = landmarks[point, 2] - PRIOR_INVERSE_DEPTH
         cost += 0.5 * PRIOR_INFORMATION * away * away
         _begin_landmark(sums, begin, end, of_one, away)
+        is_possible = abs(landmarks[point, 2]) <= _MAX_INVERSE_DEPTH  # else it goes back to its prior
         for n in range(first, last):
             k, j = structure.state[n], structure.camera[n]
-            in_front = whiten_view(
+            in_front = is_possible and whiten_view(
                 poses[k], cameras, j, structure.odom_T_landmark[point], landmarks[point], structure.rays[n], sigma_px,
                 True, by_lens, rows,
             )  # fmt: skip
