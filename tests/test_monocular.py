@@ -41,7 +41,7 @@ from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import States
-from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
+from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Eliminated, Structure, landmarks_after, located
 from graphvio.monocular.window import MAX_ERROR2
 from graphvio.monocular.window_prior import Prior, add_prior, first_prior
 from graphvio.rig import Camera, Rig, SingleCamera
@@ -607,6 +607,8 @@ def test_a_landmark_of_impossible_inverse_depth_says_nothing_of_the_poses() -> N
         at = equations(measured, states, wrong, prior)
         np.testing.assert_allclose(at.hessian, without.hessian, rtol=1e-9, atol=1e-9 * np.abs(without.hessian).max())
         assert (at.errors2[: measured.structure.rows[1]] > MAX_ERROR2).all()
+        after = adjust(measured, states, wrong, prior, 1).landmarks[0, 2]
+        assert abs(after - PRIOR_INVERSE_DEPTH) < 1.0
 
 
 def prior_between_poses(rng: np.random.Generator) -> tuple[States, Prior, Float]:

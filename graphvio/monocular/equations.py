@@ -27,7 +27,7 @@ from graphvio.self_calibration.bundle import inverse3
 from graphvio.self_calibration.parameters import CAMERA, SINGLE
 
 _ERROR2_BEHIND = 1e6  # of a landmark behind the camera
-_MAX_INVERSE_DEPTH = 10.0  # as wide as the prior: a mismatch, which would hold poses by its nearness
+_MAX_INVERSE_DEPTH = PRIOR_INFORMATION**-0.5  # 10 / m; what is nearer is a mismatch, and would hold the poses
 
 
 class _Sums(NamedTuple):

@@ -198,7 +198,7 @@ def inertial_equations(samples: InertialSamples, states: InertialStates) -> Iner
     size = 9 * n + GRAVITY + PARAMETERS
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     errors2, cost = np.full(max(n - 1, 0), np.nan), 0.0
-    columns, row = np.empty(_COLUMNS, dtype=np.int64), np.empty(_COLUMNS)
+    columns, row, whitened = np.empty(_COLUMNS, dtype=np.int64), np.empty(_COLUMNS), np.empty(9)
     for i in range(n - 1):
         start_ns, end_ns = samples.keyframes_ns[i], samples.keyframes_ns[i + 1]
         first, last = covering_samples(
@@ -216,17 +216,19 @@ def inertial_equations(samples: InertialSamples, states: InertialStates) -> Iner
         )  # fmt: skip
         _put_columns(n, i, columns)
         whitener, error2 = whitener_of(preintegrated.covariance), 0.0
-        _take_noise(preintegrated, states.parameters, error, whitener, jacobian)
+        for r in range(9):
+            whitened[r] = 0.0
+            for k in range(r + 1):
+                whitened[r] += whitener[r, k] * error[k]
+            error2 += whitened[r] * whitened[r]
+        _take_noise(preintegrated, states.parameters, whitener, whitened, error2, jacobian)
         for r in range(9):
             put(row, np.zeros(_COLUMNS))
-            whitened = 0.0
             for k in range(r + 1):
-                whitened += whitener[r, k] * error[k]
                 for c in range(_COLUMNS):
                     row[c] += whitener[r, k] * jacobian[k, c]
-            error2 += whitened * whitened
             for c in range(_COLUMNS):
-                gradient[columns[c]] += row[c] * whitened
+                gradient[columns[c]] += row[c] * whitened[r]
                 for d in range(c, _COLUMNS):
                     one, other = min(columns[c], columns[d]), max(columns[c], columns[d])
                     hessian[one, other] += row[c] * row[d]
@@ -240,30 +242,27 @@ def inertial_equations(samples: InertialSamples, states: InertialStates) -> Iner
 
 @kernel
 def _take_noise(
-    preintegrated: Preintegrated, parameters: Float, error: Float, whitener: Float, jacobian: Float
+    preintegrated: Preintegrated, parameters: Float, whitener: Float, whitened: Float, error2: float, jacobian: Float
 ) -> None:
     """Take the noise that an error shows out of its derivatives with respect to the accelerometer's matrix.
 
     The derivatives are proportional to readings that have the noise of the error: errors in variables, by which a scale
-    that vision does not know either shrinks, by a percent in minutes. Without it the gradient is that of the error's
-    square where its covariance grows with the matrix. W. A. Fuller, *Measurement Error Models*, Wiley 1987,
+    that vision does not know either shrinks, by a percent in minutes. Without that noise, the gradient is that of the
+    squared error, whose covariance grows with the matrix. W. A. Fuller, *Measurement Error Models*, Wiley 1987,
     section 1.1. The gyro's noise is so small beside what it measures that its matrix needs none of this.
 
     Args:
         preintegrated: the IMU.
         parameters: (25,) of it.
-        error: (9,).
-        whitener: (9, 9) of it.
+        whitener: (9, 9) of the error.
+        whitened: (9,) error.
+        error2: its square.
         jacobian: (9, 46) is changed.
     """
-    weighed, error2 = np.zeros(9), 0.0
+    weighed = np.zeros(9)
     for r in range(9):
-        whitened = 0.0
         for k in range(r + 1):
-            whitened += whitener[r, k] * error[k]
-        error2 += whitened * whitened
-        for k in range(r + 1):
-            weighed[k] += whitener[r, k] * whitened
+            weighed[k] += whitener[r, k] * whitened[r]
     weighed *= _MAX_NOISE2 / max(error2, _MAX_NOISE2)
     middle, (of_velocity, of_both, of_position) = preintegrated.middle_rotation, preintegrated.force_variances
     axes = middle @ sensor_matrix(parameters, ACCEL_MATRIX)
