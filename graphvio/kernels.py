@@ -9,17 +9,15 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 import numba
 import numpy as np
 from numba.core import event as numba_event
-from numba.core.compiler import Compiler
 
-from graphvio.compiled_code import KernelCache
-from graphvio.fast_math import fast_math_compiler
+from graphvio.compiled_code import InlinedKernel, Kernel
 from graphvio.kernel_cache import compiled_names
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_ANY_ORDER = fast_math_compiler(frozenset({"reassoc", "contract", "arcp", "nsz"}))
-_FAST = fast_math_compiler(frozenset({"fast"}))
+_ANY_ORDER = frozenset({"reassoc", "contract", "arcp", "nsz"})
+_FAST = frozenset({"fast"})
 _registered: list[Any] = []
 _compilers: list[subprocess.Popen[bytes]] = []
 _log = logging.getLogger(__name__)
@@ -27,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function with numba: no GIL, cached on disk, IEEE division (no exception on 1/0)."""
-    return _compile(function, Compiler)
+    return _compiled(function)
 
 
 def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -35,7 +33,7 @@ def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     Equal inputs still give equal results on one machine.
     """
-    return _compile(function, _ANY_ORDER)
+    return _compiled(function, _ANY_ORDER)
 
 
 def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -43,17 +41,13 @@ def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     Equal inputs still give equal results on one machine.
     """
-    return _compile(function, _FAST)
+    return _compiled(function, _FAST)
 
 
-def _compile(function: Callable[P, R], compiler: type[Compiler]) -> Callable[P, R]:
-    # What a kernel calls becomes part of it. Else the linker takes whichever copy of the callee it met first, and these
-    # differ by how often they were optimised: the run that compiles would not give what later ones give.
-    compiled = numba.njit(
-        nogil=True, error_model="numpy", forceinline=True, no_cfunc_wrapper=True, pipeline_class=compiler
-    )(function)
-    if compiled is not function:  # as with NUMBA_DISABLE_JIT
-        compiled._cache = KernelCache(function)
+def _compiled(function: Callable[P, R], fast_math: frozenset[str] = frozenset()) -> Callable[P, R]:
+    if numba.config.DISABLE_JIT:  # NUMBA_DISABLE_JIT, to debug kernels as Python
+        return function
+    compiled = Kernel(function, fast_math)
     _registered.append(compiled)
     return cast(Callable[P, R], compiled)
 
@@ -90,7 +84,7 @@ class CompilationProgress(NamedTuple):
 
 
 def compilation_progress() -> CompilationProgress | None:
-    """Return how many kernels are compiled, or None where this process has compiled none; from any thread."""
+    """Return how many kernels are compiled, or None where none had to be compiled; from any thread."""
     if not _announcer.has_announced:
         return None
     kernels = list(_registered)
@@ -98,17 +92,23 @@ def compilation_progress() -> CompilationProgress | None:
     return CompilationProgress(len(names), len(kernels), names[-1] if names else "")
 
 
+def announce_compilation() -> None:
+    """Log, once in a process, that kernels are being compiled, here or in a process of `compile_elsewhere`."""
+    if not _announcer.has_announced:
+        _announcer.has_announced = True
+        _log.warning("compiling numerical kernels for this machine, once; it takes about a minute")
+
+
 class _Announcer(numba_event.Listener):  # type: ignore[misc]
-    """Logs, once in a process, that kernels are being compiled."""
+    """Announces that kernels are compiled in this process."""
 
     def __init__(self) -> None:
         self.has_announced = False
 
     def on_start(self, event: Any) -> None:
         """Handle that numba begins to compile a function that no cache holds."""
-        if not self.has_announced and event.data["dispatcher"] in _registered:
-            self.has_announced = True
-            _log.warning("compiling numerical kernels for this machine, once; it takes about a minute")
+        if isinstance(event.data["dispatcher"], Kernel | InlinedKernel):
+            announce_compilation()
 
     def on_end(self, event: Any) -> None:
         """Handle that numba has compiled a function."""

@@ -1,18 +1,22 @@
 """Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives.
 
-Compiling takes a minute of one core. Where the cache is empty, a second process compiles the kernels that estimate a
-motion and, while the odometry may begin, those of the self-calibration, which is to wait for it. Another program that
-compiles at the same time is waited for.
+Compiling takes a minute of one core. Where the cache is empty, two other processes do it: one for tracking and IMU, one
+for what estimates a motion and then, while the odometry may begin, for the self-calibration, which is to wait for it.
+They need not save memory, and this one stays as small as with a full cache. Another program that compiles at the same
+time is waited for.
 """
 
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import pickle
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
+from typing import IO
 
 import gtsam
 import numpy as np
@@ -38,7 +42,7 @@ from graphvio.frontend.tracker import GroupTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
 from graphvio.kernel_cache import any_compiled_before, cache_root
-from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_elsewhere
+from graphvio.kernels import announce_compilation, await_compilers, compile_elsewhere, is_compiling_elsewhere
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
 from graphvio.monocular.warm_up import warm_up_keyframe_window
@@ -49,9 +53,10 @@ from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
 _CALIBRATION = "graphvio.self_calibration.bundle"
-_MOTION_IS_COMPILED = b"motion"
 _COMPILED_LAST = ("graphvio.frontend.lucas_kanade", "graphvio.frontend.refinement", "graphvio.backend.propagation")
-_OTHER_PROCESS = "from graphvio.warmup import compile_for_another; compile_for_another()"
+_OTHER_PROCESS = "import sys; from graphvio.warmup import compile_for_another; compile_for_another(sys.argv[1])"
+_IS_COMPILED = b"."  # what a process writes when it has what a first pose needs
+_NEW_OBJECTS = 20_000  # after which garbage is collected; with Python's 700 that takes an eighth of the time
 
 
 def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> None:
@@ -77,12 +82,21 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
         warm_up_adjustment(rig)
 
 
-def compile_for_another() -> None:
-    """Compile what `_compile_in_parallel` leaves, for the pickled rig and configuration of the standard input."""
+def compile_for_another(part: str) -> None:
+    """Compile one of the two parts of `_compile_in_parallel`, as a process of its own.
+
+    Args:
+        part: ``"tracking"`` or ``"motion"``; of the rig and configuration that come pickled in the standard input.
+    """
+    gc.set_threshold(_NEW_OBJECTS)
     rig, config = pickle.load(sys.stdin.buffer)
-    _warm_up_motion(rig, config)
-    os.write(sys.stdout.fileno(), _MOTION_IS_COMPILED)
-    if config.estimates_calibration:
+    if part == "tracking":
+        _warm_up_tracking(rig, config)
+        _warm_up_imu(rig.imu or Imu())
+    else:
+        _warm_up_motion(rig, config)
+    os.write(sys.stdout.fileno(), _IS_COMPILED)
+    if part == "motion" and config.estimates_calibration:
         warm_up_adjustment(rig)
 
 
@@ -93,27 +107,32 @@ def _are_compiled(config: Config) -> bool:
 
 
 def _compile_in_parallel(rig: Rig, config: Config) -> None:
-    """Compile the kernels of tracking and IMU here, the others in a second process; only one program does so at a time.
+    """Compile the kernels in two other processes; only one program does so at a time.
 
-    It returns once a motion can be estimated. The second process holds the lock until it has finished.
+    It returns once both have what a first pose needs, or have failed: what is missing is compiled here then. They hold
+    the lock until they have finished.
     """
     with (cache_root() / "compiling.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if _are_compiled(config):
             return  # by the program that was waited for
-        command, pipe = [sys.executable, "-c", _OTHER_PROCESS], subprocess.PIPE
-        other = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, pass_fds=[lock.fileno()])
-        compile_elsewhere(other)
-        assert other.stdin is not None
-        assert other.stdout is not None
-        try:
-            pickle.dump((rig, config), other.stdin)
-            other.stdin.close()
-        except BrokenPipeError:
-            return  # it does not find graphvio, for instance: everything is compiled here
-        _warm_up_tracking(rig, config)
-        _warm_up_imu(rig.imu or Imu())
-        other.stdout.read(len(_MOTION_IS_COMPILED))
+        announce_compilation()
+        compilers = [_started(part, pickle.dumps((rig, config)), lock) for part in ("tracking", "motion")]
+        for compiler in compilers:
+            assert compiler.stdout is not None
+            compiler.stdout.read(len(_IS_COMPILED))
+
+
+def _started(part: str, rig_and_config: bytes, lock: IO[str]) -> subprocess.Popen[bytes]:
+    """Return a new process that compiles a part."""
+    command, pipe = [sys.executable, "-c", _OTHER_PROCESS, part], subprocess.PIPE
+    compiler = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, pass_fds=[lock.fileno()])
+    compile_elsewhere(compiler)
+    assert compiler.stdin is not None
+    with suppress(BrokenPipeError):  # it does not find graphvio, for instance
+        compiler.stdin.write(rig_and_config)
+        compiler.stdin.close()
+    return compiler
 
 
 def _track_singles(rig: Rig, config: Config, rng: np.random.Generator) -> None:

@@ -86,26 +86,31 @@ def test_compilation_progress_counts_the_kernels_in_the_cache(tmp_path: Path) ->
     assert newest == "so3_exp"
 
 
-def test_loaded_kernels_parse_their_intermediate_code_when_a_caller_is_compiled(tmp_path: Path) -> None:
-    setup = "import numpy as np; from graphvio import geometry; skew = geometry.skew; skew(np.zeros(3));"
-    caller = (
-        "library = skew.overloads[skew.signatures[0]].library; parsed = [library._shared_module is not None];"
-        "pose = geometry.se3_exp(np.arange(6.0)); parsed.append(library._shared_module is not None);"
-        "print(skew.stats.cache_hits.total(), *parsed, *pose.ravel())"
-    )
+def test_kernels_are_compiled_for_python_or_for_other_kernels_as_needed(tmp_path: Path) -> None:
     environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(tmp_path)}
 
-    def ran(program: str) -> list[str]:
-        return subprocess.run(
+    def ran(call: str) -> tuple[list[list[int]], list[str]]:
+        program = (
+            f"import numpy as np; from graphvio import geometry; result = {call};"
+            "kernels = geometry._of_skew, geometry._of_skew._inlined, geometry.so3_exp, geometry.so3_exp._inlined;"
+            "print([[each.stats.cache_misses.total(), each.stats.cache_hits.total()] for each in kernels]);"
+            "print(*result.ravel())"
+        )
+        done = subprocess.run(
             [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-        ).stdout.split()
+        )
+        counts, result = done.stdout.splitlines()
+        return ast.literal_eval(counts), result.split()
 
-    ran(setup)
-    compiled, loaded = ran(setup + caller), ran(setup + caller)
-    assert compiled[:3] == ["1", "False", "True"]
-    assert loaded[:3] == ["1", "False", "False"]
-    assert loaded[3:] == compiled[3:]
-    assert len(compiled) == 19
+    neither, compiled, loaded = [0, 0], [1, 0], [0, 1]
+    turn, pose = "geometry.so3_exp(np.arange(3.0))", "geometry.se3_exp(np.arange(6.0))"
+    first = ran(turn)
+    assert first[0] == [neither, compiled, compiled, neither]
+    assert ran(turn) == ([neither, neither, loaded, neither], first[1])
+    of_pose = ran(pose)  # which calls both
+    assert of_pose[0] == [neither, loaded, neither, compiled]
+    assert ran(pose) == ([neither] * 4, of_pose[1])
+    assert [of_pose[1][at] for at in (0, 1, 2, 4, 5, 6, 8, 9, 10)] == first[1]
 
 
 @pytest.mark.parametrize("order", [("plain", "any_order", "fast"), ("fast", "any_order", "plain")])

@@ -92,38 +92,41 @@ assert compiled() == before, compiled() - before
 """
 
 
-def test_other_process_compiles_motion_and_calibration() -> None:
+@pytest.mark.parametrize(("part", "modules"), [
+    ("tracking", ["graphvio.frontend.lucas_kanade", "graphvio.backend.propagation"]),
+    ("motion", ["graphvio.frontend.refinement", graphvio.warmup._CALIBRATION]),
+])  # fmt: skip
+def test_other_process_compiles_its_part(part: str, modules: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", graphvio.warmup._OTHER_PROCESS],
+        [sys.executable, "-c", graphvio.warmup._OTHER_PROCESS, part],
         input=pickle.dumps((default_rig(), Config())),
         capture_output=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == graphvio.warmup._MOTION_IS_COMPILED
-    assert all(
-        map(graphvio.kernel_cache.any_compiled_before, ("graphvio.frontend.refinement", graphvio.warmup._CALIBRATION))
-    )
+    assert done.stdout == graphvio.warmup._IS_COMPILED
+    assert all(map(graphvio.kernel_cache.any_compiled_before, modules))
 
 
-@pytest.mark.parametrize("other_process", ["works", "fails"])
-def test_warm_up_compiles_in_parallel_and_survives_a_failing_process(other_process: str) -> None:
+@pytest.mark.parametrize("other_processes", ["work", "fail"])
+def test_warm_up_compiles_in_parallel_and_survives_failing_processes(other_processes: str) -> None:
     """In a process of its own, which takes the kernels for uncompiled though the cache has them, to be done sooner."""
     program = f"""
 from graphvio import kernels, warmup
 from graphvio.config import Config
 from graphvio.simulation import default_rig
-if {other_process == "fails"}:
+if {other_processes == "fail"}:
     warmup._OTHER_PROCESS = "raise SystemExit(1)"
 warmup._are_compiled = lambda config: False
 warmup.warm_up(default_rig(), Config())
-print(len(kernels._compilers), kernels.is_compiling_elsewhere(), kernels._compilers[0].returncode)
+print(kernels.is_compiling_elsewhere(), *[each.returncode for each in kernels._compilers])
 names = [kernel.py_func.__name__ for kernel in kernels._registered if kernel.signatures]
 print("register" in names, "_refined" in names, "eliminate_landmarks" in names)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["1", "False", str(int(other_process == "fails")), "True", "True", "True"]
+    code = str(int(other_processes == "fail"))
+    assert done.stdout.split() == ["False", code, code, "True", "True", "True"]
 
 
 def test_compile_in_parallel_waits_for_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
