@@ -1,9 +1,9 @@
 """Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives.
 
 Compiling takes a minute of one core. Where the cache is empty, two other processes do it: one for tracking and IMU, one
-for what estimates a motion and then, while the odometry may begin, for the self-calibration, which is to wait for it.
-They need not save memory, and this one stays as small as with a full cache. Another program that compiles at the same
-time is waited for.
+for what estimates a motion, or the window of single cameras, and then, while the odometry may begin, for the
+self-calibration, which is to wait for it. This process stays as small as with a full cache. Another program that
+compiles at the same time is waited for.
 """
 
 from __future__ import annotations
@@ -53,8 +53,10 @@ from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
 _CALIBRATION = "graphvio.self_calibration.bundle"
-_COMPILED_LAST = ("graphvio.frontend.lucas_kanade", "graphvio.frontend.refinement", "graphvio.backend.propagation")
+_COMPILED_LAST = ("graphvio.frontend.lucas_kanade", "graphvio.backend.propagation")
+_MOTION, _WINDOW = "graphvio.frontend.refinement", "graphvio.self_calibration.moving_landmarks"
 _OTHER_PROCESS = "import sys; from graphvio.warmup import compile_for_another; compile_for_another(sys.argv[1])"
+_PARTS = ("tracking", "motion")
 _IS_COMPILED = b"."  # what a process writes when it has what a first pose needs
 _NEW_OBJECTS = 20_000  # after which garbage is collected; with Python's 700 that takes an eighth of the time
 
@@ -70,39 +72,47 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
     """
     if not rig.pairs:  # whose calibration the window estimates, by its own kernels
         config = replace(config, calibration=replace(config.calibration, online=False))
-    if not _are_compiled(config):
+    if not _are_compiled(rig, config):
         _compile_in_parallel(rig, config)
-    _warm_up_tracking(rig, config)
-    _warm_up_imu(rig.imu or Imu())
-    _warm_up_motion(rig, config)
-    if not rig.pairs:
-        warm_up_keyframe_window(rig)
+    for part in _PARTS:
+        _warm_up_part(part, rig, config)
     if config.estimates_calibration and (wait_for_calibration or not is_compiling_elsewhere()):
         await_compilers()
         warm_up_adjustment(rig)
 
 
 def compile_for_another(part: str) -> None:
-    """Compile one of the two parts of `_compile_in_parallel`, as a process of its own.
+    """Compile one of the `_PARTS`, as a process of its own, and after the motions what is needed later.
 
     Args:
-        part: ``"tracking"`` or ``"motion"``; of the rig and configuration that come pickled in the standard input.
+        part: which one, for the rig and the configuration that come pickled in the standard input.
     """
     gc.set_threshold(_NEW_OBJECTS)
     rig, config = pickle.load(sys.stdin.buffer)
-    if part == "tracking":
-        _warm_up_tracking(rig, config)
-        _warm_up_imu(rig.imu or Imu())
-    else:
-        _warm_up_motion(rig, config)
+    _warm_up_part(part, rig, config)
     os.write(sys.stdout.fileno(), _IS_COMPILED)
     if part == "motion" and config.estimates_calibration:
         warm_up_adjustment(rig)
+    if part == "motion" and not rig.pairs:
+        _warm_up_motion(rig, config)  # for the closure of loops
 
 
-def _are_compiled(config: Config) -> bool:
+def _warm_up_part(part: str, rig: Rig, config: Config) -> None:
+    """Call one half of the kernels that a first pose needs."""
+    if part == "tracking":
+        _warm_up_tracking(rig, config)
+        _warm_up_imu(rig.imu or Imu())
+    elif rig.pairs:
+        _warm_up_motion(rig, config)
+    else:
+        warm_up_keyframe_window(rig)
+
+
+def _are_compiled(rig: Rig, config: Config) -> bool:
     """Return whether the cache holds the kernels, as far as the modules that are compiled last show."""
-    modules = (*_COMPILED_LAST, _CALIBRATION) if config.estimates_calibration else _COMPILED_LAST
+    modules = [*_COMPILED_LAST, _MOTION if rig.pairs else _WINDOW]
+    if config.estimates_calibration:
+        modules.append(_CALIBRATION)
     return all(any_compiled_before(module) for module in modules)
 
 
@@ -114,10 +124,10 @@ def _compile_in_parallel(rig: Rig, config: Config) -> None:
     """
     with (cache_root() / "compiling.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if _are_compiled(config):
+        if _are_compiled(rig, config):
             return  # by the program that was waited for
         announce_compilation()
-        compilers = [_started(part, pickle.dumps((rig, config)), lock) for part in ("tracking", "motion")]
+        compilers = [_started(part, pickle.dumps((rig, config)), lock) for part in _PARTS]
         for compiler in compilers:
             assert compiler.stdout is not None
             compiler.stdout.read(len(_IS_COMPILED))
