@@ -107,15 +107,12 @@ def test_requests_that_are_too_large_are_refused_unread(server: GrpcServer) -> N
             with pytest.raises(grpc.RpcError) as caught:
                 call(huge[:size], timeout=20.0)
             assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        grown = []
-        for _ in range(2):
+        for count in (10, 15):  # the first fill the buffers of both sides
             before = resident_bytes()
-            for _ in range(30):
+            for _ in range(count):
                 with pytest.raises(grpc.RpcError):
                     call(huge, timeout=20.0)
-            grown.append(resident_bytes() - before)
-        assert grown[0] < 120 * MB  # buffers of both sides; 240 MB came
-        assert grown[1] < 30 * MB  # and more requests need no more of them
+        assert resident_bytes() - before < 40 * MB  # of 120 that came
 
 
 def test_metadata_that_is_too_large_is_refused(server: GrpcServer) -> None:
