@@ -9,7 +9,8 @@ from graphvio.warmup import warm_up
 
 simulator = make_simulator("room")
 simulator.frameset(0)
-warm_up(simulator.rig, Config())
+for rig in (simulator.rig, simulator.rig.without_pairs()):
+    warm_up(rig, Config())
 
 turns = make_simulator("calibration", duration_s=10.0, stationary_s=0.0)
 paths = [turns.world_T_body @ pair.left.body_T_cam for pair in turns.rig.pairs]

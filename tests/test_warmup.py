@@ -22,6 +22,7 @@ from graphvio.config import Config
 from graphvio.frontend.tracker import GroupTracker
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.simulation import default_rig
+from graphvio.simulation.named_rigs import NAMED_RIGS, rig_of
 from graphvio.warmup import warm_up
 
 _FRAMES = 6
@@ -115,6 +116,7 @@ def test_warm_up_compiles_in_parallel_and_survives_failing_processes(other_proce
 from graphvio import kernels, warmup
 from graphvio.config import Config
 from graphvio.simulation import default_rig
+from graphvio.simulation.named_rigs import NAMED_RIGS, rig_of
 if {other_processes == "fail"}:
     warmup._OTHER_PROCESS = "raise SystemExit(1)"
 warmup._are_compiled = lambda *_: False
@@ -151,3 +153,12 @@ def test_warmup_command_names_the_folder_of_the_kernels() -> None:
     assert done.output.startswith(f"kernels are compiled in {graphvio.kernel_cache.cache_root()} (")
     names = {name for _, name, _ in compiled()}
     assert {"_interpolated", "rotation_from_quat_wxyz"} <= names  # which a recording with a truth needs at its end
+
+
+def test_warmup_command_leaves_no_kernel_of_any_rig_to_be_compiled() -> None:
+    assert CliRunner().invoke(app, ["warmup"]).exit_code == 0
+    before = compiled()
+    for name in NAMED_RIGS:
+        warm_up(rig_of(name), Config())
+    warm_up(default_rig().without_pairs(), Config())
+    assert compiled() == before

@@ -9,11 +9,15 @@ import typer
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
 
+_WITH_PAIRS = ("paper", "stereo+back")  # each kind of rig has kernels of its own
+_SINGLE_CAMERAS = ("surround", "phone")
+
 
 def warmup(config: options.ConfigName = "default") -> None:
     """Compile the numerical kernels for this machine, once: for images of machines and containers.
 
-    The first command does so by itself. GRAPHVIO_CACHE_DIR names the folder of the compiled kernels.
+    They are those of all kinds of rigs; the first command compiles by itself those of its own. GRAPHVIO_CACHE_DIR
+    names the folder of the compiled kernels.
 
     Examples:
 
@@ -27,11 +31,14 @@ def warmup(config: options.ConfigName = "default") -> None:
     from graphvio.config import Config
     from graphvio.geometry import rotation_from_quat_wxyz
     from graphvio.kernel_cache import cache_root
-    from graphvio.simulation import default_rig
+    from graphvio.simulation.named_rigs import rig_of
     from graphvio.trajectory import Trajectory
 
     begun_s = perf_counter()
-    warm_up_visibly(default_rig(), Config.load(config))
+    settings = Config.load(config)
+    single_cameras = _SINGLE_CAMERAS if settings.fusion.estimator == "smoother" else ()
+    for name in (*_WITH_PAIRS, *single_cameras):
+        warm_up_visibly(rig_of(name), settings)
     poses = Trajectory(np.array([0, 2]), np.tile(np.eye(4), (2, 1, 1)))
     poses.at(np.array([1]), max_gap_s=1.0)  # as a true trajectory is compared with
     rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 0.0]))

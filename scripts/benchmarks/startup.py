@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
     report.table(["start", *(f"{part}, s" for part in _PARTS), "sum, s", "aim, s", "result"], rows)
     if not args.no_cold:
         report.add(
-            f"`graphvio warmup` with an empty cache, which also waits for the kernels of the self-calibration: "
+            "`graphvio warmup` with an empty cache, for all kinds of rigs and with the self-calibration: "
             f"{whole.wall_s:.0f} s, {whole.cpu_s:.0f} s of processor time."
         )
     commands = []
