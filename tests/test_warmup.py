@@ -116,7 +116,6 @@ def test_warm_up_compiles_in_parallel_and_survives_failing_processes(other_proce
 from graphvio import kernels, warmup
 from graphvio.config import Config
 from graphvio.simulation import default_rig
-from graphvio.simulation.named_rigs import NAMED_RIGS, rig_of
 if {other_processes == "fail"}:
     warmup._OTHER_PROCESS = "raise SystemExit(1)"
 warmup._are_compiled = lambda *_: False
