@@ -152,7 +152,7 @@ def _compiler(library: type[JITCodeLibrary], fast_math: frozenset[str]) -> type[
         def run_pass(self, state: Any) -> bool:
             state.library = library(state.targetctx.codegen(), state.func_id.func_qualname)
             state.library.enable_object_caching()
-            state.flags.no_compile = True
+            state.flags.no_compile = True  # to machine code, which `make_callable` does where it is needed
             super().run_pass(state)
             state.library.make_callable(state)
             return True
@@ -196,7 +196,8 @@ class _EntryImplementation(CompileResultCacheImpl):  # type: ignore[misc]
 
     _locator_classes: ClassVar = [_Locator]
 
-    def rebuild(self, target_context: Any, stored: Any) -> Any:
+    def rebuild(self, target_context: Any, stored: Any) -> CompileResult:
+        """Return the kernel of what was stored."""
         description = stored[1]
         # numba asks these names from the intermediate code
         target_context.codegen()._engine._defined_symbols |= {
@@ -211,6 +212,7 @@ class _InlinedImplementation(CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes: ClassVar = [_Locator]
 
     def rebuild(self, target_context: Any, stored: Any) -> CompileResult:
+        """Return the kernel of what was stored."""
         library, description, environment, signature, objectmode, lifted, annotation, reload_init, referenced = stored
         return CompileResult(
             typing_context=target_context.typing_context,

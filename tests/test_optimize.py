@@ -309,7 +309,7 @@ def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path
     first = load_rig(out / "walk" / "rig-refined.yaml")
     error = se3_log(se3_inverse(rig.left2_T_left1()) @ first.left2_T_left1())
     sigma_deg = first.calibration_sigmas.pair_rotation_deg
-    assert sigma_deg < 0.5 * rig.calibration_sigmas.pair_rotation_deg
+    assert sigma_deg < 0.25 * rig.calibration_sigmas.pair_rotation_deg
     assert np.rad2deg(np.linalg.norm(error[:3])) < 3.4 * sigma_deg  # 99 % of three components
     used = load_rig(out / "walk" / "odometry" / "rig.yaml")
     np.testing.assert_allclose(used.left2_T_left1(), first.left2_T_left1(), atol=1e-12)
