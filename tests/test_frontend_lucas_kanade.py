@@ -9,7 +9,8 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import build_pyramid, register, track
-from graphvio.frontend.patches import lattice, packed, prepare, room, sample_affine, scratch_room
+from graphvio.frontend.patches import lattice, prepare, room
+from graphvio.frontend.sampling import packed
 
 LEVELS = 4
 
@@ -250,23 +251,6 @@ def test_sample_up_to_the_edge_stays_within_the_image() -> None:
     assert found[inside].mean() > 0.9
     assert not found[(pixels < 8.0).any(axis=1)].any()
     np.testing.assert_allclose(moved[found], pixels[found], atol=0.01)
-
-
-@pytest.mark.parametrize("half", [4, 7, 8])
-def test_sample_affine_interpolates_pixel_by_pixel(half: int) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
-    warp, middle = np.array([[1.1, 0.2], [-0.15, 0.9]]), np.array([41.3, 30.6])
-    inside, scratch, out, side = lattice(half).inside, scratch_room(half), room(half), 2 * half + 1
-    a, b, c, d = warp.ravel()
-    assert sample_affine(packed(image), middle[0], middle[1], a, b, c, d, inside, scratch, out)
-    steps = np.arange(-half, half + 1.0)
-    x, y = np.moveaxis(middle + np.stack(np.meshgrid(steps, steps), axis=-1) @ warp.T, -1, 0)
-    expected = cv2.remap(image.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
-    rows = out.rows
-    np.testing.assert_allclose(rows[:, :side], expected, atol=4.0)  # remap rounds places to 1/32 pixel
-    assert np.abs(rows[:, :side] - expected).mean() < 1.0
-    assert not rows[:, side:].any()
-    assert not sample_affine(packed(image), 5.0, 30.0, a, b, c, d, inside, scratch, out)
 
 
 @pytest.mark.parametrize("half", [3, 6, 7, 10, 15])

@@ -6,7 +6,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import register
-from graphvio.frontend.patches import packed
+from graphvio.frontend.sampling import packed
 from graphvio.frontend.slanted import align_slanted
 
 HALF = 7

@@ -22,7 +22,7 @@ class CornerConfig(StageConfig):
     noise_factor: float = 1.5
     """Smallest rms gradient of a corner where they are scarce, as a multiple of the standard deviation of the image's
     noise."""
-    border_px: int = 8
+    border_px: int = 9
     """Corners and tracks nearer to the image's edge are dropped."""
 
     def cell_px(self, width_px: int) -> int:

@@ -7,8 +7,8 @@ import numpy as np
 from graphvio.arrays import AnyArray, Bool, Float, Image, Int
 from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.matching import TwoCameras
-from graphvio.frontend.patches import packed
 from graphvio.frontend.prediction import around, inverse_depths_around, predict_warps
+from graphvio.frontend.sampling import packed
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.rig import CameraGroup, SingleCamera
 

@@ -13,18 +13,9 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import (
-    align,
-    correlation,
-    lattice,
-    localisation2,
-    prepare,
-    room,
-    sample,
-    sample_affine,
-    scratch_room,
-    weaker2,
-)
+from graphvio.frontend.alignment import align
+from graphvio.frontend.patches import correlation, lattice, localisation2, prepare, room, weaker2
+from graphvio.frontend.sampling import sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
 
 MIN_GRADIENT = 1.0
@@ -128,7 +119,7 @@ def register(
     """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
 
     Args:
-        source: image that holds the patches, as of `graphvio.frontend.patches.packed`.
+        source: image that holds the patches, as of `graphvio.frontend.sampling.packed`.
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel with respect to the target pixel.

@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
-from graphvio.frontend.patches import pack
+from graphvio.frontend.sampling import pack
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.frontend.tracks import passes, usable_at

@@ -8,25 +8,15 @@ order. Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import (
-    Lattice,
-    Patch,
-    Scratch,
-    align,
-    correlation,
-    different_contrast,
-    lattice,
-    prepare,
-    room,
-    sample,
-    sample_affine,
-    scratch_room,
-)
+from graphvio.frontend.alignment import align, different_contrast
+from graphvio.frontend.patches import Lattice, Patch, correlation, lattice, prepare, room
+from graphvio.frontend.sampling import Scratch, sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
 _CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early would bias towards the depth of before
 _CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
+_CONVERGED_SHARE = 0.5  # of such a step that the next one may have, if steps go on getting shorter as they do
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
@@ -45,7 +35,7 @@ def align_slanted(
     Args:
         left: image (height, width).
         right: image (height, width).
-        packed_right: the right image as of `graphvio.frontend.patches.packed`.
+        packed_right: the right image as of `graphvio.frontend.sampling.packed`.
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) initial pixels in the right image.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
@@ -76,7 +66,7 @@ def align_slanted(
                 right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], normal, 0.0, True
             )
         _steepest_descent(columns, grid, ex, ey)
-        gain = 1.0
+        gain, before = 1.0, 0.0
         for k in range(_MAX_ITERATIONS):
             if not _sample_sheared(packed_right, parameters, ex, ey, grid.inside, scratch, sheared):
                 break
@@ -88,9 +78,11 @@ def align_slanted(
             _project(columns, sheared, patch, gain, step)
             _solve(factor, step)
             _compose(parameters, step, ex, ey)
-            if _is_small(step):
+            size = _size(step)
+            if size < 1.0 or size * size < _CONVERGED_SHARE * before:
                 found[i] = True
                 break
+            before = size
         moved[i, 0], moved[i, 1] = parameters[0], parameters[1]
         found_slopes[i, 0], found_slopes[i, 1] = parameters[2], parameters[3]
         if found[i]:
@@ -189,10 +181,11 @@ def _solve(factor: Float, b: Float) -> None:
 
 
 @fast_kernel
-def _is_small(step: Float) -> bool:
-    shift2 = step[0] * step[0] + step[1] * step[1]
-    slope2 = step[2] * step[2] + step[3] * step[3]
-    return bool(shift2 < _CONVERGED_PX * _CONVERGED_PX and slope2 < _CONVERGED_SLOPE * _CONVERGED_SLOPE)
+def _size(step: Float) -> float:
+    """Return the size of a step as a multiple of one after which an iteration has converged."""
+    shift = np.sqrt(step[0] * step[0] + step[1] * step[1]) / _CONVERGED_PX
+    slope = np.sqrt(step[2] * step[2] + step[3] * step[3]) / _CONVERGED_SLOPE
+    return float(max(shift, slope))
 
 
 @fast_kernel

@@ -12,8 +12,8 @@ from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH
-from graphvio.frontend.patches import pack
 from graphvio.frontend.prediction import around, predict_warps
+from graphvio.frontend.sampling import pack
 from graphvio.frontend.stereo import (
     FINE_STEPS,
     HALF_COARSE_PATCH,
