@@ -8,7 +8,13 @@ from synthetic import transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.cameras import project_points
-from graphvio.frontend.prediction import around, inverse_depths_around, predict_pixels, predict_warps
+from graphvio.frontend.prediction import (
+    around,
+    inverse_depths_around,
+    predict_pixels,
+    predict_warps,
+    stereo_warps,
+)
 from graphvio.rig import Camera, StereoPair
 
 PAIR = two_pair_rig().pairs[0]
@@ -84,7 +90,7 @@ def test_predict_warps_are_nearest_to_the_deformation_of_a_slanted_wall(lens: tu
     motion = transform([0.01, -0.03, 0.02], [0.05, 0.05, -0.35])
     at = around(pixels(), STEP_PX)
     rays = unprojected(at, camera)
-    warps, shifts, valid = predict_warps(
+    warps, bends, valid = predict_warps(
         rays, on_wall(rays), STEP_PX, motion, camera.model_number, camera.intrinsics, camera.distortion
     )
     assert valid.all()
@@ -94,21 +100,22 @@ def test_predict_warps_are_nearest_to_the_deformation_of_a_slanted_wall(lens: tu
         source = pixels()[k] + offsets
         target = seen_after(source, motion, camera) - seen_after(pixels()[k : k + 1], motion, camera)
         mapped = target @ warps[k].T
-        constants.append(np.mean(offsets - mapped - shifts[k], axis=0))
+        bent = (offsets**2 @ bends[k]) @ warps[k].T
+        constants.append(np.mean(offsets - mapped + bent, axis=0))
         by_centre.append(np.mean(offsets - mapped, axis=0))
-        np.testing.assert_allclose(mapped + shifts[k], offsets, atol=0.2)
+        np.testing.assert_allclose(mapped, offsets, atol=0.3)
     assert np.abs(constants).max() < 0.004  # pixels
     assert np.abs(by_centre).max() > 0.015  # what a map that is right at the centre alone would add to every point
 
 
 def test_predict_warps_without_motion_are_the_identity() -> None:
     rays = unprojected(around(pixels(), STEP_PX))
-    warps, shifts, valid = predict_warps(
+    warps, bends, valid = predict_warps(
         rays, on_wall(rays), STEP_PX, np.eye(4), CAMERA.model_number, CAMERA.intrinsics, CAMERA.distortion
     )
     assert valid.all()
     np.testing.assert_allclose(warps, np.tile(np.eye(2), (50, 1, 1)), atol=1e-6)
-    np.testing.assert_allclose(shifts, 0.0, atol=1e-6)
+    np.testing.assert_allclose(bends, 0.0, atol=1e-7)
 
 
 def test_predict_warps_of_hidden_surfaces_are_invalid() -> None:
@@ -158,17 +165,28 @@ def test_inverse_depths_around_unseen_points_are_their_own() -> None:
     np.testing.assert_array_equal(found, np.tile(on_wall(rays[0]), (5, 1)))
 
 
-def test_inverse_depths_around_far_points_have_no_slant() -> None:
-    """At infinity the right image is the left one turned, and its slopes are those of the rotation."""
-    at = around(pixels(), STEP_PX)
-    rays, far = unprojected(at), np.zeros(50)
-    turned = np.empty((50, 2))
-    direction = along(PAIR, rays[0], far)
-    for k, step in enumerate(np.eye(2)):
-        ahead, behind = (right_pixel(PAIR, unprojected(at[0] + sign * step), far) for sign in (1.0, -1.0))
-        turned[:, k] = np.sum((0.5 * (ahead - behind) - step) * direction, axis=1)
-    found = inverse_depths_around(rays, far, turned, STEP_PX, *right_view(PAIR))
-    np.testing.assert_allclose(found, 0.0, atol=1e-4)  # 1/m
+@with_lenses
+def test_stereo_warps_are_derivatives_at_constant_depth(lens: tuple[str, Float]) -> None:
+    pair, at = through(lens), pixels()
+    rays = unprojected(at, pair.left)
+    depths = on_wall(rays)
+    warps, bends = stereo_warps(rays, depths, STEP_PX, pair.right_T_left, *lens_of(pair.left), *lens_of(pair.right))
+    middle = right_pixel(pair, rays, depths)
+    for k, step in enumerate(STEP_PX * np.eye(2)):
+        ahead, behind = (right_pixel(pair, unprojected(at + s * step, pair.left), depths) for s in (1.0, -1.0))
+        np.testing.assert_allclose(warps[:, :, k], (ahead - behind) / (2.0 * STEP_PX), atol=1e-4)
+        np.testing.assert_allclose(bends[:, k], (0.5 * (ahead + behind) - middle) / STEP_PX**2, atol=1e-5)
+
+
+def test_stereo_warps_where_a_lens_does_not_reach_are_the_identity() -> None:
+    behind = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])
+    warps, bends = stereo_warps(rays(3), np.full(3, 0.5), STEP_PX, behind, *lens_of(CAMERA), *lens_of(CAMERA))
+    np.testing.assert_array_equal(warps, np.tile(np.eye(2), (3, 1, 1)))
+    assert not bends.any()
+
+
+def lens_of(camera: Camera) -> tuple[int, Float, Float]:
+    return camera.model_number, camera.intrinsics, camera.distortion
 
 
 def right_view(pair: StereoPair) -> tuple[Float, int, Float, Float]:
@@ -178,10 +196,15 @@ def right_view(pair: StereoPair) -> tuple[Float, int, Float, Float]:
 def slopes(pair: StereoPair, at: Float) -> Float:
     """What stereo matching would measure on the wall: the shift's derivative with respect to the left pixel."""
     rays = unprojected(at, pair.left)
-    direction, measured = along(pair, rays, on_wall(rays)), np.empty((len(at), 2))
+    depths = on_wall(rays)
+    direction, measured = along(pair, rays, depths), np.empty((len(at), 2))
     for k, step in enumerate(np.eye(2)):
-        ahead, behind = (seen_after(at + s * step, pair.right_T_left, pair.left, pair.right) for s in (1.0, -1.0))
-        measured[:, k] = np.sum((0.5 * (ahead - behind) - step) * direction, axis=1)
+        slanted, level = np.zeros((2, len(at), 2))
+        for sign in (1.0, -1.0):
+            beside = at + sign * step
+            slanted += 0.5 * sign * seen_after(beside, pair.right_T_left, pair.left, pair.right)
+            level += 0.5 * sign * right_pixel(pair, unprojected(beside, pair.left), depths)
+        measured[:, k] = np.sum((slanted - level) * direction, axis=1)
     return measured
 
 

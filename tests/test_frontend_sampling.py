@@ -73,8 +73,8 @@ def test_register_at_any_fraction_of_a_pixel_is_unbiased() -> None:
         grid = np.stack(np.meshgrid(np.arange(20.0, 140.0, 12.0), np.arange(20.0, 100.0, 12.0)), axis=-1).reshape(-1, 2)
         pixels, everything = grid + fraction, np.ones(len(grid), dtype=bool)
         moved, found, _, _ = register(
-            packed(image(np.zeros(2))), image(shift), pixels, np.tile(np.eye(2), (len(grid), 1, 1)), pixels, everything,
-            7, 2.0, 1.0, False,
+            packed(image(np.zeros(2))), image(shift), pixels, np.tile(np.eye(2), (len(grid), 1, 1)),
+            np.zeros((len(grid), 2, 2)), pixels, everything, 7, 2.0, 1.0, False,
         )  # fmt: skip
         assert found.mean() > 0.9
         errors.append((moved - pixels - shift)[found])

@@ -6,8 +6,8 @@ Gauss-Newton, whose gradients and normal matrix belong to the patch (inverse com
 
 import numpy as np
 
-from graphvio.arrays import Image
-from graphvio.frontend.patches import LANES, NormalEquations, Patch, weaker2
+from graphvio.arrays import Float, Image
+from graphvio.frontend.patches import LANES, Lattice, NormalEquations, Patch, weaker2
 from graphvio.frontend.sampling import interpolated_row, spline_weights
 from graphvio.kernels import fast_kernel
 
@@ -99,3 +99,32 @@ def align(
         if step_u * step_u + step_v * step_v < _CONVERGED_PX * _CONVERGED_PX:
             return u, v, True
     return u, v, False
+
+
+@fast_kernel
+def shift_by_bends(gx: Patch, gy: Patch, grid: Lattice, normal: NormalEquations, bends: Float) -> tuple[float, float]:
+    """Compute by how much an alignment is off where an affine map leaves out second derivatives.
+
+    Args:
+        gx: the patch's gradient along its rows.
+        gy: along its columns.
+        grid: of the patch.
+        normal: its normal equations.
+        bends: (2, 2) half of the second derivative along the rows, and along the columns, 1/px.
+    """
+    dx, dy, xs, ys = gx.flat, gy.flat, grid.columns.flat, grid.rows.flat
+    bx = by = _ZERO
+    b00, b01, b10, b11 = (
+        np.float32(bends[0, 0]),
+        np.float32(bends[0, 1]),
+        np.float32(bends[1, 0]),
+        np.float32(bends[1, 1]),
+    )
+    for k in range(dx.size):
+        x2, y2 = xs[k] * xs[k], ys[k] * ys[k]
+        along = dx[k] * (b00 * x2 + b10 * y2) + dy[k] * (b01 * x2 + b11 * y2)
+        bx += dx[k] * along
+        by += dy[k] * along
+    determinant = normal.xx * normal.yy - normal.xy * normal.xy
+    x, y = (normal.yy * bx - normal.xy * by) / determinant, (normal.xx * by - normal.xy * bx) / determinant
+    return float(x), float(y)

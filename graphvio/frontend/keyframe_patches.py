@@ -7,7 +7,7 @@ import numpy as np
 from graphvio.arrays import AnyArray, Bool, Float, Image, Int
 from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.matching import TwoCameras
-from graphvio.frontend.prediction import around, inverse_depths_around, predict_warps
+from graphvio.frontend.prediction import around, inverse_depths_around, patch_deviation_px, predict_warps
 from graphvio.frontend.sampling import packed
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.rig import CameraGroup, SingleCamera
@@ -30,8 +30,7 @@ class KeyframePatches:
     def __init__(self, group: CameraGroup, window_px: int) -> None:
         self._group = group
         self._half = window_px // 2
-        side = 2 * self._half + 1
-        self._step_px = float(np.sqrt((side**2 - 1) / 12.0))  # standard deviation of a patch's pixels
+        self._step_px = patch_deviation_px(self._half)
         self._frame = TrackedFrame.empty()
         self._image: AnyArray | None = None  # packed
         self._rays: Float = np.zeros((5, 0, 2))  # around each of the tracks
@@ -115,7 +114,7 @@ class KeyframePatches:
         rows = np.minimum(np.searchsorted(frame.ids, ids), len(frame.ids) - 1)
         wanted = (frame.ids[rows] == ids) & frame.has_depth[rows]
         camera = self._group.left
-        warps, shifts, usable = predict_warps(
+        warps, bends, usable = predict_warps(
             np.take(self._rays, rows, axis=1),  # indexing would have another layout, and for one row yet another
             np.take(self._inverse_depths, rows, axis=1),
             self._step_px,
@@ -127,8 +126,9 @@ class KeyframePatches:
         pixels, found, _, correlations = register(
             self._image,
             image,
-            frame.pixels[rows] + shifts,
+            frame.pixels[rows],
             warps,
+            bends,
             guess,
             wanted & usable,
             self._half,

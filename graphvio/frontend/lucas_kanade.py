@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.alignment import align
+from graphvio.frontend.alignment import align, shift_by_bends
 from graphvio.frontend.patches import correlation, lattice, localisation2, prepare, room, weaker2
 from graphvio.frontend.sampling import sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
@@ -113,7 +113,7 @@ def _forth_and_back(
 
 @fast_kernel
 def register(
-    source: AnyArray, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
+    source: AnyArray, target: Image, pixels: Float, warps: Float, bends: Float, guess: Float, wanted: Bool, half: int,
     max_shift_px: float, min_gradient: float, is_other_camera: bool,
 ) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
     """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
@@ -123,6 +123,8 @@ def register(
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel with respect to the target pixel.
+        bends: (N, 2, 2) half of the second derivative of the target pixel along the rows of the source, and along its
+            columns, 1/px.
         guess: (N, 2) in the target.
         wanted: (N,) which patches to find.
         half: of the patch's side, without its middle.
@@ -139,7 +141,7 @@ def register(
     moved, correlations = guess.copy(), np.full(n, -1.0)
     found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
-    inside, inside_border, scratch = lattice(half).inside, lattice(half + 1).inside, scratch_room(half + 1)
+    grid, inside_border, scratch = lattice(half), lattice(half + 1).inside, scratch_room(half + 1)
     most2 = _MAX_SIGMA_PX**2
     least2 = (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
@@ -148,16 +150,17 @@ def register(
             source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], inside_border, scratch, bordered
         ):
             continue
-        normal = prepare(bordered, inside, patch, gx, gy)
+        normal = prepare(bordered, grid.inside, patch, gx, gy)
         localised[i] = weaker2(normal.xx, normal.xy, normal.yy) >= least2
         x, y = guess[i, 0], guess[i, 1]
         u, v, converged = align(target, x, y, patch, gx, gy, normal, min_gradient, is_other_camera)
         if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
             if not sample(target, u, v, half + 1, bordered):
                 continue
-            normal = prepare(bordered, inside, seen, gx, gy)
+            shift_x, shift_y = shift_by_bends(gx, gy, grid, normal, bends[i])
+            normal = prepare(bordered, grid.inside, seen, gx, gy)
             if not localisation2(patch, seen, normal) <= most2:
                 continue
-            moved[i, 0], moved[i, 1], found[i] = u, v, True
+            moved[i, 0], moved[i, 1], found[i] = u - shift_x, v - shift_y, True
             correlations[i] = correlation(patch, seen)
     return moved, found, localised, correlations

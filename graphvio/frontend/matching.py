@@ -10,6 +10,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
+from graphvio.frontend.prediction import patch_deviation_px, stereo_warps
 from graphvio.frontend.sampling import pack
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
@@ -153,9 +154,12 @@ class StereoMatcher:
         guess += self._shift_px
         found = passes(np.ones(len(pixels), dtype=bool), seen & in_reach, "search", rejected)
         half = tracking.window_px // 2
+        warps, bends = stereo_warps(
+            rays, expected, patch_deviation_px(half), pair.right_T_left, *_lens(pair.left), *_lens(pair.right)
+        )
         pack(right[0], self._packed_right)
         matched, slopes, correlations, converged = align_slanted(
-            left[0], right[0], self._packed_right, pixels, guess, directions, slopes, known, found, half
+            left[0], right[0], self._packed_right, pixels, guess, directions, warps, bends, slopes, known, found, half
         )
         shift = np.hypot(matched[:, 0] - guess[:, 0], matched[:, 1] - guess[:, 1])
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX + self._margin_px)
@@ -169,7 +173,8 @@ class StereoMatcher:
                 self._packed_right,
                 left[0],
                 matched[unchecked],
-                np.eye(2) + directions[unchecked, :, None] * slopes[unchecked, None, :],
+                warps[unchecked] + directions[unchecked, :, None] * slopes[unchecked, None, :],
+                np.zeros((len(unchecked), 2, 2)),
                 pixels[unchecked],
                 np.ones(len(unchecked), dtype=bool),
                 half,
@@ -218,6 +223,10 @@ class StereoMatcher:
         )
 
 
+def _lens(camera: Camera) -> tuple[int, Float, Float]:
+    return camera.model_number, camera.intrinsics, camera.distortion
+
+
 def _projection(pair: TwoCameras) -> tuple[Float, int, Float, Float]:
     """Return what projects points of the left camera into the right image."""
-    return pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion
+    return pair.right_T_left, *_lens(pair.right)

@@ -58,11 +58,11 @@ def predict_warps(
         distortion: (8,) of the camera.
 
     Returns:
-        Derivatives (N, 2, 2) of the pixel before with respect to the pixel after; the shift (N, 2) of the affine map's
-        centre from the point, in the image before, pixels; and whether both exist (N,).
+        Derivatives (N, 2, 2) of the pixel before with respect to the pixel after; halves of the second derivatives
+        (N, 2, 2) of the pixel after, along the rows and along the columns before, 1/px; and whether both exist (N,).
     """
     n = inverse_depths.shape[1]
-    warps, shifts, valid = np.zeros((n, 2, 2)), np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)
+    warps, bends, valid = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros(n, dtype=np.bool_)
     limit = fold_radius(model, distortion)
     u, v = np.empty(5), np.empty(5)
     for i in range(n):
@@ -80,11 +80,89 @@ def predict_warps(
             continue
         warps[i, 0, 0], warps[i, 0, 1] = d / area, -b / area
         warps[i, 1, 0], warps[i, 1, 1] = -c / area, a / area
-        mean_u, mean_v = 0.5 * (u[1] + u[2] + u[3] + u[4]) - 2.0 * u[0], 0.5 * (v[1] + v[2] + v[3] + v[4]) - 2.0 * v[0]
-        shifts[i, 0] = -warps[i, 0, 0] * mean_u - warps[i, 0, 1] * mean_v
-        shifts[i, 1] = -warps[i, 1, 0] * mean_u - warps[i, 1, 1] * mean_v
+        for axis in range(2):
+            first, second = 2 * axis + 1, 2 * axis + 2
+            bends[i, axis, 0] = (0.5 * (u[first] + u[second]) - u[0]) / (step_px * step_px)
+            bends[i, axis, 1] = (0.5 * (v[first] + v[second]) - v[0]) / (step_px * step_px)
         valid[i] = True
-    return warps, shifts, valid
+    return warps, bends, valid
+
+
+@kernel
+def stereo_warps(
+    rays: Float, inverse_depths: Float, step_px: float, right_T_left: Float,
+    left_model: int, left_intrinsics: Float, left_distortion: Float,
+    right_model: int, right_intrinsics: Float, right_distortion: Float,
+) -> tuple[Float, Float]:  # fmt: skip
+    """Compute how the right image shows the surroundings of points, as far as lenses and the cameras' rotation do it.
+
+    Args:
+        rays: (N, 2) normalised coordinates in the left camera.
+        inverse_depths: (N,) of the points and their surroundings, 1/m.
+        step_px: how far around a point it is looked, as of `around`.
+        right_T_left: (4, 4).
+        left_model: number of the left camera's model.
+        left_intrinsics: (4,).
+        left_distortion: (8,).
+        right_model: number of the right camera's model.
+        right_intrinsics: (4,).
+        right_distortion: (8,).
+
+    Returns:
+        Derivatives (N, 2, 2) of the right pixel with respect to the left one, and halves of its second derivatives
+        (N, 2, 2), along the left image's rows and along its columns, 1/px; the identity and zero where a camera's model
+        does not reach that far.
+    """
+    n = len(rays)
+    warps, bends = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
+    left_limit, right_limit = fold_radius(left_model, left_distortion), fold_radius(right_model, right_distortion)
+    left, right, steps = np.empty((5, 2)), np.empty((5, 2)), np.zeros((5, 2))
+    for i in range(n):
+        warps[i, 0, 0] = warps[i, 1, 1] = 1.0
+        _, _, a, b, c, d = distort(left_model, left_distortion, rays[i, 0], rays[i, 1])
+        area = a * d - b * c
+        if not area > 0.0:
+            continue
+        per_column, per_row = step_px / (area * left_intrinsics[0]), step_px / (area * left_intrinsics[1])
+        steps[2, 0], steps[2, 1], steps[4, 0], steps[4, 1] = d * per_column, -c * per_column, -b * per_row, a * per_row
+        steps[1], steps[3] = -steps[2], -steps[4]
+        all_ok = True
+        for k in range(5):
+            x, y = rays[i, 0] + steps[k, 0], rays[i, 1] + steps[k, 1]
+            left[k, 0], left[k, 1], ok = _project(x, y, 1.0, left_limit, left_model, left_intrinsics, left_distortion)
+            x, y, z = _moved(x, y, inverse_depths[i], right_T_left)
+            right[k, 0], right[k, 1], also_ok = _project(
+                x, y, z, right_limit, right_model, right_intrinsics, right_distortion
+            )
+            all_ok &= ok and also_ok
+        if all_ok:
+            _differentiate(left, right, warps[i], bends[i])
+    return warps, bends
+
+
+@kernel
+def _differentiate(before: Float, after: Float, warp: Float, bends: Float) -> None:
+    """Fill first and halves of second derivatives of a map of pixels from five of them (5, 2), see `around`."""
+    a, b = before[2, 0] - before[1, 0], before[4, 0] - before[3, 0]
+    c, d = before[2, 1] - before[1, 1], before[4, 1] - before[3, 1]
+    area = a * d - b * c
+    for row in range(2):
+        along, across = after[2, row] - after[1, row], after[4, row] - after[3, row]
+        warp[row, 0], warp[row, 1] = (along * d - across * c) / area, (across * a - along * b) / area
+    for axis in range(2):
+        first, second = 2 * axis + 1, 2 * axis + 2
+        mean_x = 0.5 * (before[first, 0] + before[second, 0]) - before[0, 0]
+        mean_y = 0.5 * (before[first, 1] + before[second, 1]) - before[0, 1]
+        step_x, step_y = 0.5 * (before[second, 0] - before[first, 0]), 0.5 * (before[second, 1] - before[first, 1])
+        for row in range(2):
+            mean = 0.5 * (after[first, row] + after[second, row]) - after[0, row]
+            mean -= warp[row, 0] * mean_x + warp[row, 1] * mean_y
+            bends[axis, row] = mean / (step_x * step_x + step_y * step_y)
+
+
+def patch_deviation_px(half: int) -> float:
+    """Return the standard deviation of the pixels of a patch, ``2 half + 1`` on each side, along one of them."""
+    return float(np.sqrt(half * (half + 1) / 3.0))
 
 
 def around(pixels: Float, step_px: float) -> Float:
@@ -99,9 +177,6 @@ def inverse_depths_around(
     intrinsics: Float, distortion: Float,
 ) -> Float:  # fmt: skip
     """Compute the inverse depths around points from the slant of their surface, which stereo matching measured.
-
-    The right image shows a patch's surroundings shifted along the epipolar line, by the left pixel times the slope.
-    The cameras' rotation and lenses account for a part of that shift, depth for the remainder.
 
     Args:
         rays: (5, N, 2) normalised coordinates in the left camera, see `around`.
@@ -119,34 +194,24 @@ def inverse_depths_around(
     n = len(inverse_depths)
     depths = np.empty((5, n))
     limit = fold_radius(model, distortion)
-    u, v = np.empty(5), np.empty(5)
-    changes, steps = np.empty(2), np.empty((2, 2))  # of inverse depth and ray, from left to right and downwards
     for i in range(n):
         w = inverse_depths[i]
         depths[:, i] = w
+        x, y, z = _moved(rays[0, i, 0], rays[0, i, 1], w, right_T_left)
+        u, v, ok = _project(x, y, z, limit, model, intrinsics, distortion)
         x, y, z = _moved(rays[0, i, 0], rays[0, i, 1], w + _NEARER, right_T_left)
-        near_u, near_v, all_ok = _project(x, y, z, limit, model, intrinsics, distortion)
-        for k in range(5):
-            x, y, z = _moved(rays[k, i, 0], rays[k, i, 1], w, right_T_left)
-            u[k], v[k], ok = _project(x, y, z, limit, model, intrinsics, distortion)
-            all_ok &= ok
-        along_u, along_v = (near_u - u[0]) / _NEARER, (near_v - v[0]) / _NEARER
-        length = np.hypot(along_u, along_v)  # pixels for an inverse depth of 1/m
-        if not all_ok or length < 1e-6:
+        near_u, near_v, also_ok = _project(x, y, z, limit, model, intrinsics, distortion)
+        length = np.hypot(near_u - u, near_v - v) / _NEARER  # pixels for an inverse depth of 1/m
+        if not (ok and also_ok) or length < 1e-6:
             continue
-        along_u, along_v = along_u / length, along_v / length
-        for k in range(2):
-            left, right = 2 * k + 1, 2 * k + 2
-            flat = ((u[right] - u[left]) * along_u + (v[right] - v[left]) * along_v) / (2.0 * step_px)
-            seen = slopes[i, k] + (along_u if k == 0 else along_v)
-            changes[k] = 2.0 * step_px * (seen - flat) / length
-            steps[k, 0], steps[k, 1] = rays[right, i, 0] - rays[left, i, 0], rays[right, i, 1] - rays[left, i, 1]
+        rightwards, downwards = 2.0 * step_px * slopes[i, 0] / length, 2.0 * step_px * slopes[i, 1] / length
+        a, c = rays[2, i, 0] - rays[1, i, 0], rays[2, i, 1] - rays[1, i, 1]
+        b, d = rays[4, i, 0] - rays[3, i, 0], rays[4, i, 1] - rays[3, i, 1]
         # A plane's inverse depth is linear in normalised coordinates, which are not linear in pixels.
-        determinant = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
+        determinant = a * d - b * c
         if not determinant > 0.0:  # next to the edge of what the lens can see
             continue
-        by_x = (changes[0] * steps[1, 1] - changes[1] * steps[0, 1]) / determinant
-        by_y = (changes[1] * steps[0, 0] - changes[0] * steps[1, 0]) / determinant
+        by_x, by_y = (rightwards * d - downwards * c) / determinant, (downwards * a - rightwards * b) / determinant
         for k in range(1, 5):
             depths[k, i] += by_x * (rays[k, i, 0] - rays[0, i, 0]) + by_y * (rays[k, i, 1] - rays[0, i, 1])
     return depths

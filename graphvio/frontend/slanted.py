@@ -1,15 +1,16 @@
 """Alignment of a left patch in the right image, where the surface that it shows may be slanted.
 
 Seen from two places, the patch of a slanted surface is sheared along the epipolar line: its disparity varies
-linearly over the patch. Two slopes in addition to the translation make the alignment exact for any plane, to first
-order. Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
+linearly over the patch. Two slopes in addition to the translation, and what lenses and the cameras' rotation do, make
+the alignment exact for any plane, to first order; what lenses do in second order shifts a patch by what its gradients
+see of it. Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
 """
 
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.frontend.alignment import align, different_contrast
-from graphvio.frontend.patches import Lattice, Patch, correlation, lattice, prepare, room
+from graphvio.frontend.patches import Lattice, NormalEquations, Patch, correlation, lattice, prepare, room
 from graphvio.frontend.sampling import Scratch, sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
 
@@ -17,6 +18,7 @@ _MAX_ITERATIONS = 10
 _CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early would bias towards the depth of before
 _CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
 _CONVERGED_SHARE = 0.5  # of such a step that the next one may have, if steps go on getting shorter as they do
+_MIN_GAIN, _MAX_GAIN = 0.8, 1.25  # of images that are exposed alike
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
@@ -27,8 +29,8 @@ _Columns = tuple[Patch, Patch, Patch, Patch]
 
 @fast_kernel
 def align_slanted(
-    left: Image, right: Image, packed_right: AnyArray, pixels: Float, guess: Float, directions: Float, slopes: Float,
-    known: Bool, wanted: Bool, half: int,
+    left: Image, right: Image, packed_right: AnyArray, pixels: Float, guess: Float, directions: Float, warps: Float,
+    bends: Float, slopes: Float, known: Bool, wanted: Bool, half: int,
 ) -> tuple[Float, Float, Float, Bool]:  # fmt: skip
     """Align patches of the left image in the right one.
 
@@ -39,7 +41,10 @@ def align_slanted(
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) initial pixels in the right image.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
-        slopes: (N, 2) initial slopes: derivative of the shift along the line with respect to the left pixel.
+        warps: (N, 2, 2) of surfaces at constant depth, see `graphvio.frontend.prediction.stereo_warps`.
+        bends: (N, 2, 2) likewise.
+        slopes: (N, 2) initial slopes: derivative of the shift along the line with respect to the left pixel, of which
+            the slant is the cause.
         known: (N,) whether guess and slopes are known from before; elsewhere the patch is first shifted alone.
         wanted: (N,) which patches to align.
         half: of the patch's side, without its middle.
@@ -53,12 +58,12 @@ def align_slanted(
     found = np.zeros(n, dtype=np.bool_)
     bordered, patch, sheared = room(half + 1), room(half), room(half)
     columns, grid, scratch = (room(half), room(half), room(half), room(half)), lattice(half), scratch_room(half)
-    factor, parameters, step = np.empty((4, 4)), np.empty(4), np.empty(4)
+    factor, parameters, step, shift = np.empty((4, 4)), np.empty(4), np.empty(4), np.empty(2)
     for i in range(n):
         if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
             continue
         normal = prepare(bordered, grid.inside, patch, columns[0], columns[1])
-        ex, ey = directions[i, 0], directions[i, 1]
+        ex, ey = _in_left_image(directions[i], warps[i])
         parameters[0], parameters[1] = guess[i, 0], guess[i, 1]
         parameters[2], parameters[3] = slopes[i, 0], slopes[i, 1]
         if not known[i]:
@@ -66,28 +71,43 @@ def align_slanted(
                 right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], normal, 0.0, True
             )
         _steepest_descent(columns, grid, ex, ey)
-        gain, before = 1.0, 0.0
+        _shift_by_bends(columns, normal, ex, ey, bends[i], shift)
+        gain, before, is_exposed_alike = 1.0, 0.0, True
         for k in range(_MAX_ITERATIONS):
-            if not _sample_sheared(packed_right, parameters, ex, ey, grid.inside, scratch, sheared):
+            if not _sample_sheared(packed_right, parameters, warps[i], directions[i], grid.inside, scratch, sheared):
                 break
+            contrast = _contrast(sheared, normal.pp)
             if k == 0:
-                gain = different_contrast(_contrast(sheared, normal.pp))
-                if gain != 1.0:
+                gain = different_contrast(contrast)
+                is_exposed_alike = gain == 1.0
+                if not is_exposed_alike:
                     _eliminate_contrast(columns, patch, normal.pp)
                 _factorise(columns, factor)
+            if is_exposed_alike:  # what is left of a difference would be taken for slopes
+                gain = min(max(contrast, _MIN_GAIN), _MAX_GAIN)
             _project(columns, sheared, patch, gain, step)
             _solve(factor, step)
-            _compose(parameters, step, ex, ey)
+            _compose(parameters, step, ex, ey, warps[i])
             size = _size(step)
             if size < 1.0 or size * size < _CONVERGED_SHARE * before:
                 found[i] = True
                 break
             before = size
+        if found[i]:
+            parameters[0] -= shift[0]
+            parameters[1] -= shift[1]
+            correlations[i] = correlation(patch, sheared)
         moved[i, 0], moved[i, 1] = parameters[0], parameters[1]
         found_slopes[i, 0], found_slopes[i, 1] = parameters[2], parameters[3]
-        if found[i]:
-            correlations[i] = correlation(patch, sheared)
     return moved, found_slopes, correlations, found
+
+
+@fast_kernel
+def _in_left_image(direction: Float, warp: Float) -> tuple[float, float]:
+    """Return which shift in the left image is a unit shift along the epipolar line in the right one."""
+    a, b, c, d = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
+    area = a * d - b * c
+    return (d * direction[0] - b * direction[1]) / area, (a * direction[1] - c * direction[0]) / area
 
 
 @fast_kernel
@@ -107,6 +127,22 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
     for k in range(gx.size):
         by_x[k] -= inside[k] * mean_x
         by_y[k] -= inside[k] * mean_y
+
+
+@fast_kernel
+def _shift_by_bends(
+    columns: _Columns, normal: NormalEquations, ex: float, ey: float, bends: Float, shift: Float
+) -> None:
+    """Fill by how much second derivatives of the map (2, 2) shift a patch (2,), as its gradients weigh its pixels."""
+    along2 = ex * ex * normal.xx + 2.0 * ex * ey * normal.xy + ey * ey * normal.yy
+    by_x, by_y = columns[2].flat, columns[3].flat
+    x2 = y2 = np.float32(0.0)
+    for k in range(by_x.size):
+        x2 += by_x[k] * by_x[k]
+        y2 += by_y[k] * by_y[k]
+    share_x, share_y = float(x2) / max(along2, _SHIFT_PRIOR), float(y2) / max(along2, _SHIFT_PRIOR)
+    shift[0] = share_x * bends[0, 0] + share_y * bends[1, 0]
+    shift[1] = share_x * bends[0, 1] + share_y * bends[1, 1]
 
 
 @fast_kernel
@@ -190,22 +226,25 @@ def _size(step: Float) -> float:
 
 @fast_kernel
 def _sample_sheared(
-    image: AnyArray, parameters: Float, ex: float, ey: float, inside: Patch, scratch: Scratch, out: Patch
+    image: AnyArray, parameters: Float, warp: Float, direction: Float, inside: Patch, scratch: Scratch, out: Patch
 ) -> bool:
     """Sample the patch at the parameters ``[u, v, slope x, slope y]``; False where it leaves the image."""
     u, v, a, b = parameters[0], parameters[1], parameters[2], parameters[3]
-    return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, inside, scratch, out)
+    ex, ey = direction[0], direction[1]
+    xx, xy, yx, yy = warp[0, 0] + ex * a, warp[0, 1] + ex * b, warp[1, 0] + ey * a, warp[1, 1] + ey * b
+    return sample_affine(image, u, v, xx, xy, yx, yy, inside, scratch, out)
 
 
 @fast_kernel
-def _compose(parameters: Float, step: Float, ex: float, ey: float) -> None:
+def _compose(parameters: Float, step: Float, ex: float, ey: float, warp: Float) -> None:
     """Apply the inverse of a step before the warp: ``W <- W o dW^-1``, both a shift and a shear along the line."""
     share = (1.0 + parameters[2] * ex + parameters[3] * ey) / (1.0 + step[2] * ex + step[3] * ey)
     for k in range(2, 4):
         parameters[k] = min(max(parameters[k] - share * step[k], -_MAX_SLOPE), _MAX_SLOPE)
     along = parameters[2] * step[0] + parameters[3] * step[1]
-    parameters[0] -= step[0] + ex * along
-    parameters[1] -= step[1] + ey * along
+    x, y = step[0] + ex * along, step[1] + ey * along
+    parameters[0] -= warp[0, 0] * x + warp[0, 1] * y
+    parameters[1] -= warp[1, 0] * x + warp[1, 1] * y
 
 
 @fast_kernel

@@ -12,7 +12,7 @@ from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH
-from graphvio.frontend.prediction import around, predict_warps
+from graphvio.frontend.prediction import around, patch_deviation_px, predict_warps
 from graphvio.frontend.sampling import pack
 from graphvio.frontend.stereo import (
     FINE_STEPS,
@@ -57,7 +57,7 @@ class WarpedMatcher(StereoMatcher):
         nearest, known = 1.0 / settings.min_depth_m, np.isfinite(inverse_depths)
         expected = np.where(known, np.clip(inverse_depths, 0.0, nearest), PRIOR_INVERSE_DEPTH)
         half = tracking.window_px // 2
-        step_px = float(np.sqrt(((2 * half + 1) ** 2 - 1) / 12.0))  # standard deviation of a patch's pixels
+        step_px = patch_deviation_px(half)
         beside = around(pixels, step_px)
         rays_beside = pair.left.unproject(beside.reshape(-1, 2))[0].reshape(beside.shape)
         warps, _, usable = predict_warps(rays_beside, np.tile(expected, (5, 1)), step_px, *camera)
@@ -67,12 +67,12 @@ class WarpedMatcher(StereoMatcher):
             expected[searched], seen[searched] = _warped_search(
                 left[:2], right[:2], pixels[searched], rays[searched], warps[searched], nearest, *camera
             )
-        warps, shifts, usable = predict_warps(rays_beside, np.tile(expected, (5, 1)), step_px, *camera)
+        warps, bends, usable = predict_warps(rays_beside, np.tile(expected, (5, 1)), step_px, *camera)
         guess, _, in_reach = epipolar_lines(rays, expected, *camera)
         found = passes(np.ones(len(pixels), dtype=bool), seen & usable & in_reach, "search", rejected)
         pack(left[0], self._packed_left)
         matched, registered, localised, correlations = register(
-            self._packed_left, right[0], pixels + shifts, warps, guess, found, half, _MAX_SHIFT_PX, min_gradient, True
+            self._packed_left, right[0], pixels, warps, bends, guess, found, half, _MAX_SHIFT_PX, min_gradient, True
         )
         found = passes(found, registered, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
