@@ -105,6 +105,8 @@ def align(
 def shift_by_bends(gx: Patch, gy: Patch, grid: Lattice, normal: NormalEquations, bends: Float) -> tuple[float, float]:
     """Compute by how much an alignment is off where an affine map leaves out second derivatives.
 
+    Mixed ones are left out: they shift patches whose gradients lie along a diagonal, in either direction.
+
     Args:
         gx: the patch's gradient along its rows.
         gy: along its columns.

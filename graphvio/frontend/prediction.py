@@ -64,26 +64,22 @@ def predict_warps(
     n = inverse_depths.shape[1]
     warps, bends, valid = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros(n, dtype=np.bool_)
     limit = fold_radius(model, distortion)
-    u, v = np.empty(5), np.empty(5)
+    before, after, forth = np.zeros((5, 2)), np.empty((5, 2)), np.empty((2, 2))
+    before[1, 0], before[2, 0], before[3, 1], before[4, 1] = -step_px, step_px, -step_px, step_px
     for i in range(n):
         all_ok = True
         for k in range(5):
             x, y, z = _moved(rays[k, i, 0], rays[k, i, 1], inverse_depths[k, i], motion)
-            u[k], v[k], ok = _project(x, y, z, limit, model, intrinsics, distortion)
+            after[k, 0], after[k, 1], ok = _project(x, y, z, limit, model, intrinsics, distortion)
             all_ok &= ok
         if not all_ok:
             continue
-        a, b = (u[2] - u[1]) / (2.0 * step_px), (u[4] - u[3]) / (2.0 * step_px)
-        c, d = (v[2] - v[1]) / (2.0 * step_px), (v[4] - v[3]) / (2.0 * step_px)
-        area = a * d - b * c
+        _differentiate(before, after, forth, bends[i])
+        area = forth[0, 0] * forth[1, 1] - forth[0, 1] * forth[1, 0]
         if area < _MIN_AREA:
             continue
-        warps[i, 0, 0], warps[i, 0, 1] = d / area, -b / area
-        warps[i, 1, 0], warps[i, 1, 1] = -c / area, a / area
-        for axis in range(2):
-            first, second = 2 * axis + 1, 2 * axis + 2
-            bends[i, axis, 0] = (0.5 * (u[first] + u[second]) - u[0]) / (step_px * step_px)
-            bends[i, axis, 1] = (0.5 * (v[first] + v[second]) - v[0]) / (step_px * step_px)
+        warps[i, 0, 0], warps[i, 0, 1] = forth[1, 1] / area, -forth[0, 1] / area
+        warps[i, 1, 0], warps[i, 1, 1] = -forth[1, 0] / area, forth[0, 0] / area
         valid[i] = True
     return warps, bends, valid
 
