@@ -32,9 +32,9 @@ from graphvio.frontend.cost import camera_motions
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import with_unknown_scales
 from graphvio.frontend.extrinsic_monitor import warm_up_extrinsic_monitor
+from graphvio.frontend.motion_slants import warm_up_motion_slants
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
-from graphvio.frontend.prediction import inverse_depths_around
 from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
 from graphvio.frontend.selection import best_pair_motion, searched_and_refined
 from graphvio.frontend.singles import SinglesFrontend
@@ -152,10 +152,7 @@ def _track_singles(rig: Rig, config: Config, rng: np.random.Generator) -> None:
         images = [rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in rig.cameras]
         frontend.process(FrameSet(stamp_ns, {j: (image,) for j, image in enumerate(images)}), lambda _: np.eye(4))
     frontend.close()
-    lens, one = rig.cameras[0], np.ones((5, 1, 2))
-    inverse_depths_around(
-        one, one[0, :, 0], one[0], 1.0, np.eye(4), lens.model_number, lens.intrinsics, lens.distortion
-    )  # fmt: skip
+    warm_up_motion_slants(rig.cameras[0])
 
 
 def _warm_up_tracking(rig: Rig, config: Config) -> None:

@@ -235,13 +235,13 @@ def test_calibrate_pairs_one_pair_raises(walk: Path) -> None:
 
 
 def test_calibrate_pairs_crossed_left_right_names_pair(walk: Path) -> None:
-    """Left and right of the second pair are exchanged: nothing is found where it should be."""
+    """Left and right of the second pair are exchanged: hardly anything is found where it should be."""
     rig = load_rig(walk / "rig.yaml")
     back = rig.pairs[1]
     crossed = replace(
         back, left=replace(back.left, name=back.right.name), right=replace(back.right, name=back.left.name)
     )
-    with pytest.raises(CalibrationError, match="back measured no motion"):
+    with pytest.raises(CalibrationError, match=r"back measured motion in \d of 120 framesets"):
         calibrate_pairs(open_source(walk, replace(rig, pairs=(rig.pairs[0], crossed))))
 
 

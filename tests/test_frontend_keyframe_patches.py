@@ -10,7 +10,7 @@ from waves import picture, waves
 from graphvio.arrays import Float, Image
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.tracks import TrackedFrame
-from graphvio.rig import Camera, StereoPair
+from graphvio.rig import Camera, SingleCamera, StereoPair
 
 WIDTH, HEIGHT, FOCAL, BASELINE_M = 320, 240, 250.0, 0.1
 CENTRE = np.array([0.5 * WIDTH, 0.5 * HEIGHT])
@@ -126,3 +126,47 @@ def test_find_with_a_prediction_that_hides_the_wall_finds_nothing() -> None:
     away = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])
     _, found = placed(frame).find(frame.ids, frame.pixels, view(np.eye(4)), away, MIN_GRADIENT)
     assert not found.any()
+
+
+# ------------------------------------------------------------------ slants that a single camera sees by its motion
+
+HALF_WAY = transform([0.005, 0.01, -0.015], [0.06, 0.01, -0.15])
+
+
+def by_one_camera(frame: TrackedFrame, image: Image) -> KeyframePatches:
+    patches = KeyframePatches(SingleCamera(pair().left), WINDOW_PX)
+    patches.take(replace(frame, is_single=True), image)
+    return patches
+
+
+def median_error_px(patches: KeyframePatches, frame: TrackedFrame, motion: Float, before: Float) -> float:
+    """Median error of patches found after a motion since their keyframe, which was at another place ``before``."""
+    truth = seen_after(tracks(), motion @ before)
+    pixels, found = patches.find(frame.ids, truth + 0.2, view(motion @ before), motion, MIN_GRADIENT)
+    assert found.mean() > 0.7
+    return float(np.median(np.linalg.norm(pixels - truth, axis=1)[found]))
+
+
+def test_find_by_a_single_camera_learns_the_slant_on_the_way() -> None:
+    frame, image = tracks(), view(np.eye(4))
+    at_once, on_the_way = by_one_camera(frame, image), by_one_camera(frame, image)
+    median_error_px(on_the_way, frame, HALF_WAY, np.eye(4))
+    learnt = median_error_px(on_the_way, frame, MOTION, np.eye(4))
+    assert learnt < 0.05
+    assert median_error_px(at_once, frame, MOTION, np.eye(4)) > 2.0 * learnt
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_take_hands_slants_on_to_the_next_keyframe(is_known: bool) -> None:
+    """Where the motion between the keyframes is known; else surfaces are taken to face the camera again."""
+    frame, onwards = tracks(), MOTION @ np.linalg.inv(HALF_WAY)
+    patches = by_one_camera(frame, view(np.eye(4)))
+    median_error_px(patches, frame, HALF_WAY, np.eye(4))
+    pixels = seen_after(frame, HALF_WAY)
+    rays = (pixels - CENTRE) / FOCAL
+    depth = HALF_WAY[2, :3] @ np.column_stack([frame.left_rays, np.ones(len(rays))]).T / frame.points[:, 2]
+    points = np.column_stack([rays, 1.0 / (depth + HALF_WAY[2, 3])])
+    later = replace(frame, pixels=pixels, left_rays=rays, points=points)
+    patches.take(later, view(HALF_WAY), HALF_WAY if is_known else None)
+    error_px = median_error_px(patches, later, onwards, HALF_WAY)
+    assert error_px < 0.04 if is_known else error_px > 0.05

@@ -553,7 +553,7 @@ def test_correction_moves_map_and_not_odom(rig: Rig, measurements: list[Measurem
 def test_late_iterator_gets_the_kept_keyframes_and_ends(rig: Rig, measurements: list[Measurement]) -> None:
     odometry, keyframes = Odometry(rig), list[Keyframe]()
     front_end = FrontEnd(odometry)
-    measurements = until(measurements, 50)
+    measurements = until(measurements, 90)
     for measurement in measurements[: len(measurements) // 2]:
         odometry.process(measurement)
     early = front_end.keyframes()

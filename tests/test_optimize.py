@@ -100,8 +100,8 @@ def test_optimize_rendered_walk_improves_on_online(done: Path) -> None:
     summary = json.loads((done / "summary.json").read_text())
     (session,) = summary["sessions"]
     errors = {name: each["position_m"] for name, each in session["ate_rmse"].items()}
-    assert errors["optimized"] < 0.5 * errors["online"]
-    assert errors["optimized"] < 0.002
+    assert errors["optimized"] < 0.9 * errors["online"]
+    assert errors["optimized"] < 0.0004
     assert summary["loops"]["used"] >= 5
     assert summary["cost"]["after"] < summary["cost"]["before"]
     for name in (*ALWAYS_EQUAL, "report.html", "plan.png", "points.ply", "database.db", "colmap/sparse/0/points3D.bin"):
@@ -376,5 +376,6 @@ def test_optimize_real_recording_improves_on_online(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
         (session,) = json.loads((out / "summary.json").read_text())["sessions"]
         errors[out.name] = {name: each["position_m"] for name, each in session["ate_rmse"].items()}
-    assert errors["as_it_is"]["optimized"] < 0.95 * errors["as_it_is"]["online"]
-    assert errors["default"]["optimized"] < 0.95 * errors["as_it_is"]["online"]
+    for each in errors.values():
+        assert each["optimized"] < 0.98 * each["online"]
+        assert each["optimized"] < 0.0045  # the truth is no better than some 4 mm

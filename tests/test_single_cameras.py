@@ -146,14 +146,15 @@ def test_framesets_of_live_images_hold_single_cameras_as_recordings_do() -> None
 
 
 def test_run_with_a_single_camera_is_no_worse_than_the_pair_alone(walk: Path, tmp_path: Path) -> None:
-    """Without IMU, where the second view matters, and with a calibration that is trusted."""
+    """Without IMU, where the second view matters, and with a calibration that is trusted: motions of a second."""
     rig, config = load_rig(walk).without_imu(), Config.from_yaml("calibration: {online: false}")
     alone = summary_of(walk, rig.with_pairs([0]), tmp_path / "alone", config).evaluation
     both = summary_of(walk, rig, tmp_path / "both", config)
     assert (both.completion, both.resets) == (1.0, 0)
     assert alone is not None
     assert both.evaluation is not None
-    assert both.evaluation["ate_percent"] < 0.8 * alone["ate_percent"]
+    for measure, share in (("position_m", 0.8), ("rotation_deg", 0.6)):
+        assert both.evaluation["rpe"]["1 s"][measure]["rmse"] < share * alone["rpe"]["1 s"][measure]["rmse"]
     kinds = {line.split('"kind": "')[1].split('"')[0] for line in (tmp_path / "both" / "events.jsonl").open()}
     assert EventKind.EXTRINSICS_OFF not in kinds  # the file is exact
 
@@ -238,9 +239,7 @@ def test_run_with_a_wrong_place_of_the_single_camera_learns_it(walk: Path, tmp_p
     wrong = replace(rig, singles=(SingleCamera(replace(camera, body_T_cam=turned)),))
     summary = summary_of(walk, wrong, tmp_path / "wrong")
     assert summary.evaluation is not None
-    alone = summary_of(walk, rig.with_pairs([0]), tmp_path / "alone").evaluation
-    assert alone is not None
-    assert summary.evaluation["ate_percent"] < 1.5 * alone["ate_percent"]
+    assert summary.evaluation["ate_percent"] < 0.035  # 1.4 mm, with what the first seconds are off
     learnt = load_rig(tmp_path / "wrong" / "rig-refined.yaml")
     found = learnt.pairs[0].left.cam_T_body @ learnt.singles[0].left.body_T_cam
     exact = rig.pairs[0].left.cam_T_body @ camera.body_T_cam

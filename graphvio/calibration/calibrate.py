@@ -29,6 +29,7 @@ OnFrameset = Callable[[int, SeparateMotions], bool]
 """Called after each frameset with the number of framesets and all motions so far; returns True to end the recording."""
 
 _NO_ERROR = np.zeros((6, 6))
+_MIN_MEASURED = 0.04  # of the motions of the pair that has most: exchanged images have as many by chance
 
 
 def calibrate_pairs(
@@ -65,10 +66,11 @@ def calibrate_pairs(
         raise CalibrationError(f"{rig.name} has one stereo pair; there is no other to calibrate it against")
     framesets, motions, stamps_ns, gyro = _track(opened, SeparateMotions(rig, config or Config()), on_frameset)
     names = tuple(pair.name for pair in rig.pairs)
+    most = max(measured.count for measured in motions)
     for name, measured in zip(names, motions, strict=True):
-        if not measured.count:
+        if measured.count <= _MIN_MEASURED * most:
             raise CalibrationError(
-                f"{name} measured no motion at all in {framesets} framesets: does it see texture, are its "
+                f"{name} measured motion in {measured.count} of {framesets} framesets: does it see texture, are its "
                 "left and right images in this order and not another pair's, and is its own calibration right?"
             )
     segments = segments_of_motions(motions)

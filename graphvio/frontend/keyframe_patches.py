@@ -7,9 +7,10 @@ import numpy as np
 from graphvio.arrays import AnyArray, Bool, Float, Image, Int
 from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.matching import TwoCameras
+from graphvio.frontend.motion_slants import MotionSlants, hand_on_slants
 from graphvio.frontend.prediction import around, inverse_depths_around, patch_deviation_px, predict_warps
 from graphvio.frontend.sampling import packed
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.rig import CameraGroup, SingleCamera
 
 _MAX_REGISTRATION_PX = 2.0
@@ -35,24 +36,43 @@ class KeyframePatches:
         self._image: AnyArray | None = None  # packed
         self._rays: Float = np.zeros((5, 0, 2))  # around each of the tracks
         self._inverse_depths: Float = np.zeros((5, 0))
+        self._slants: MotionSlants | None = None
+        if isinstance(group, SingleCamera):
+            self._slants = MotionSlants(self._half, self._step_px)
 
-    def take(self, frame: TrackedFrame, image: Image) -> None:
-        """Store the patches of a frame's tracks, from its left image (height, width)."""
+    def take(self, frame: TrackedFrame, image: Image, motion: Float | None = None) -> None:
+        """Store the patches of a frame's tracks.
+
+        Args:
+            frame: the new keyframe.
+            image: (height, width) its left image.
+            motion: (4, 4) of points since the keyframe before, by which a single camera's slants are handed on.
+        """
         self._image = packed(image)
-        self._place(frame)
+        self._place(frame, motion)
+        if self._slants is not None:
+            self._slants.begin(image)
 
     def recalibrate(self, group: CameraGroup) -> None:
         """Use another calibration of the cameras."""
         self._group = group
-        self._place(self._frame.recalibrated(group))
+        self._place(self._frame.recalibrated(group), np.eye(4))
 
-    def _place(self, frame: TrackedFrame) -> None:
-        """Place the patches in space, by a frame's tracks."""
+    def _place(self, frame: TrackedFrame, motion: Float | None) -> None:
+        """Place the patches in space, by a frame's tracks and the motion since the frame before, if it is known."""
+        ids, rays, inverse_depths = self._frame.ids, self._rays, self._inverse_depths
         self._frame = frame
         pixels = around(frame.pixels, self._step_px)
         self._rays = self._group.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
         if isinstance(self._group, SingleCamera):
-            self._inverse_depths = np.tile(np.maximum(frame.points[:, 2], 0.0), (5, 1))  # no slant is seen
+            self._inverse_depths = np.tile(np.maximum(frame.points[:, 2], 0.0), (5, 1))
+            before, now = common_rows(ids if motion is not None else ids[:0], frame.ids)
+            if motion is not None and len(before):
+                kept = self._inverse_depths[:, now]
+                hand_on_slants(rays[:, before], inverse_depths[:, before], motion, self._rays[:, now], kept)
+                self._inverse_depths[:, now] = kept
+            if self._slants is not None:
+                self._slants.hand_on(before, now, len(frame.ids))
             return
         right = self._group.right
         self._inverse_depths = inverse_depths_around(
@@ -92,6 +112,8 @@ class KeyframePatches:
             right.intrinsics,
             right.distortion,
         )
+        if self._slants is not None:
+            self._slants.note_measured(rows)
 
     def find(
         self, ids: Int, guess: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
@@ -138,4 +160,8 @@ class KeyframePatches:
         )
         found &= correlations > _SAME_PATCH
         pixels[~found] = guess[~found]
+        if self._slants is not None:
+            self._slants.measure(
+                camera, frame, rows[found], pixels[found], image, left_T_left_keyframe, self._rays, self._inverse_depths
+            )
         return pixels, found

@@ -64,6 +64,7 @@ class GroupTracker:
         self._patches = KeyframePatches(group, config.tracking.window_px)
         self._noise = NoiseFilter()
         self._motion: ReadoutMotion | None = None
+        self._left_T_left_keyframe: Float | None = None
 
     def observe(
         self,
@@ -87,6 +88,7 @@ class GroupTracker:
             motion: of body while rolling shutters read the images out, or None if unknown.
         """
         watch = Stopwatch()
+        self._left_T_left_keyframe = left_T_left_keyframe
         before, levels = self._left_pyramid, max(self._config.tracking.levels, 2)
         left, right = self._noise.filtered(left, right)
         self._left_pyramid = build_pyramid(left, levels)
@@ -186,7 +188,7 @@ class GroupTracker:
     def keep_keyframe_patches(self) -> None:
         """Register the tracks on the newest frame's patches from now on."""
         if self._left_pyramid:
-            self._patches.take(self._last, self._left_pyramid[0])
+            self._patches.take(self._last, self._left_pyramid[0], self._left_T_left_keyframe)
 
     def slant_keyframe_patches(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
         """Take depth and slant of the patches as another camera sees them, see `KeyframePatches.slant`."""
