@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
-from graphvio.frontend.prediction import patch_deviation_px, stereo_warps
+from graphvio.frontend.prediction import stereo_warps
 from graphvio.frontend.sampling import pack
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
@@ -154,9 +154,7 @@ class StereoMatcher:
         guess += self._shift_px
         found = passes(np.ones(len(pixels), dtype=bool), seen & in_reach, "search", rejected)
         half = tracking.window_px // 2
-        warps, bends = stereo_warps(
-            rays, expected, patch_deviation_px(half), pair.right_T_left, *_lens(pair.left), *_lens(pair.right)
-        )
+        warps, bends = stereo_warps(rays, expected, pair.right_T_left, *_lens(pair.left), *_lens(pair.right))
         pack(right[0], self._packed_right)
         matched, slopes, correlations, converged = align_slanted(
             left[0], right[0], self._packed_right, pixels, guess, directions, warps, bends, slopes, known, found, half

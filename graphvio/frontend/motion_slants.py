@@ -90,7 +90,7 @@ class MotionSlants:
             return
         rows, pixels, directions, depths = rows[wanted], pixels[wanted], directions[wanted], depths[wanted]
         middle, n = middle[wanted], len(rows)
-        warps, bends = stereo_warps(middle, depths, self._step_px, motion, *lens, *lens)
+        warps, bends = stereo_warps(middle, depths, motion, *lens, *lens)
         everything = np.ones(n, dtype=bool)
         moved, slopes, correlations, found = align_slanted(
             self._image, image, packed(image), keyframe.pixels[rows], pixels, directions, warps, bends,

@@ -6,7 +6,11 @@ from graphvio.arrays import Bool, Float
 from graphvio.cameras import distort, fold_radius
 from graphvio.kernels import kernel
 
+_RightCamera = tuple[Float, float, int, Float, Float]
+"""right_T_left, the largest radius of the lens, model, intrinsics and distortion."""
+
 _NEARER = 0.01  # 1/m, a small step of inverse depth
+_BEND_STEP_PX = 4.0  # over which derivatives are compared: some half a patch
 _MIN_AREA = 0.1  # a patch that has shrunk more than this is no longer comparable
 
 
@@ -86,7 +90,7 @@ def predict_warps(
 
 @kernel
 def stereo_warps(
-    rays: Float, inverse_depths: Float, step_px: float, right_T_left: Float,
+    rays: Float, inverse_depths: Float, right_T_left: Float,
     left_model: int, left_intrinsics: Float, left_distortion: Float,
     right_model: int, right_intrinsics: Float, right_distortion: Float,
 ) -> tuple[Float, Float]:  # fmt: skip
@@ -95,7 +99,6 @@ def stereo_warps(
     Args:
         rays: (N, 2) normalised coordinates in the left camera.
         inverse_depths: (N,) of the points and their surroundings, 1/m.
-        step_px: how far around a point it is looked, as of `around`.
         right_T_left: (4, 4).
         left_model: number of the left camera's model.
         left_intrinsics: (4,).
@@ -111,29 +114,54 @@ def stereo_warps(
     """
     n = len(rays)
     warps, bends = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
-    left_limit, right_limit = fold_radius(left_model, left_distortion), fold_radius(right_model, right_distortion)
-    left, right, steps = np.empty((5, 2)), np.empty((5, 2)), np.zeros((5, 2))
+    limit = fold_radius(right_model, right_distortion)
+    camera = (right_T_left, limit, right_model, right_intrinsics, right_distortion)
+    here, there, warp = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
     for i in range(n):
         warps[i, 0, 0] = warps[i, 1, 1] = 1.0
-        _, _, a, b, c, d = distort(left_model, left_distortion, rays[i, 0], rays[i, 1])
-        area = a * d - b * c
-        if not area > 0.0:
+        x, y, w = rays[i, 0], rays[i, 1], inverse_depths[i]
+        if not _ray_by_pixel(x, y, left_model, left_intrinsics, left_distortion, here) or not _warp_at(
+            x, y, w, here, camera, warp
+        ):
             continue
-        per_column, per_row = step_px / (area * left_intrinsics[0]), step_px / (area * left_intrinsics[1])
-        steps[2, 0], steps[2, 1], steps[4, 0], steps[4, 1] = d * per_column, -c * per_column, -b * per_row, a * per_row
-        steps[1], steps[3] = -steps[2], -steps[4]
-        all_ok = True
-        for k in range(5):
-            x, y = rays[i, 0] + steps[k, 0], rays[i, 1] + steps[k, 1]
-            left[k, 0], left[k, 1], ok = _project(x, y, 1.0, left_limit, left_model, left_intrinsics, left_distortion)
-            x, y, z = _moved(x, y, inverse_depths[i], right_T_left)
-            right[k, 0], right[k, 1], also_ok = _project(
-                x, y, z, right_limit, right_model, right_intrinsics, right_distortion
-            )
-            all_ok &= ok and also_ok
-        if all_ok:
-            _differentiate(left, right, warps[i], bends[i])
+        for row in range(2):
+            warps[i, row, 0], warps[i, row, 1] = warp[row, 0], warp[row, 1]
+        for axis in range(2):
+            u, v = x + _BEND_STEP_PX * here[0, axis], y + _BEND_STEP_PX * here[1, axis]
+            if _ray_by_pixel(u, v, left_model, left_intrinsics, left_distortion, there) and _warp_at(
+                u, v, w, there, camera, warp
+            ):
+                for row in range(2):
+                    bends[i, axis, row] = 0.5 * (warp[row, axis] - warps[i, row, axis]) / _BEND_STEP_PX
     return warps, bends
+
+
+@kernel
+def _ray_by_pixel(x: float, y: float, model: int, intrinsics: Float, distortion: Float, out: Float) -> bool:
+    """Fill the derivative (2, 2) of a ray with respect to its pixel; False where the lens does not reach that far."""
+    _, _, a, b, c, d = distort(model, distortion, x, y)
+    area = a * d - b * c
+    if not area > 0.0:
+        return False
+    out[0, 0], out[0, 1] = d / (area * intrinsics[0]), -b / (area * intrinsics[1])
+    out[1, 0], out[1, 1] = -c / (area * intrinsics[0]), a / (area * intrinsics[1])
+    return True
+
+
+@kernel
+def _warp_at(x: float, y: float, w: float, ray_by_pixel: Float, camera: _RightCamera, out: Float) -> bool:
+    """Fill the derivative (2, 2) of the right pixel with respect to the left one; False outside the right lens."""
+    m, limit, model, intrinsics, distortion = camera
+    u, v, z = _moved(x, y, w, m)
+    if not z > 1e-6 or not u * u + v * v < (limit * z) ** 2:
+        return False
+    u, v = u / z, v / z
+    _, _, a, b, c, d = distort(model, distortion, u, v)
+    for k in range(2):
+        by_x = ray_by_pixel[0, k] * (m[0, 0] - u * m[2, 0]) + ray_by_pixel[1, k] * (m[0, 1] - u * m[2, 1])
+        by_y = ray_by_pixel[0, k] * (m[1, 0] - v * m[2, 0]) + ray_by_pixel[1, k] * (m[1, 1] - v * m[2, 1])
+        out[0, k], out[1, k] = intrinsics[0] * (a * by_x + b * by_y) / z, intrinsics[1] * (c * by_x + d * by_y) / z
+    return bool(a * d - b * c > 0.0 and a > 0.0)
 
 
 @kernel
