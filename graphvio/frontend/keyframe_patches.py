@@ -92,7 +92,7 @@ class KeyframePatches:
         Args:
             found: tracks of the keyframe, matched in the other camera.
             cameras: this one, and the other.
-            is_slope_known: whether the matches' slopes mean something; else the surfaces face the camera.
+            is_slope_known: whether the matches' slopes mean something; else patches keep the slants that they have.
         """
         rows = np.minimum(np.searchsorted(self._frame.ids, found.ids), max(len(self._frame.ids) - 1, 0))
         kept = self._frame.ids[rows] == found.ids if len(self._frame.ids) else np.zeros(len(rows), dtype=bool)
@@ -100,7 +100,9 @@ class KeyframePatches:
             return
         rows, depths, right = rows[kept], np.maximum(found.points[kept, 2], 0.0), cameras.right
         if not is_slope_known:
-            self._inverse_depths[:, rows] = depths
+            before = self._inverse_depths[:, rows]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                self._inverse_depths[:, rows] = depths * np.where(before[0] > 0.0, before / before[0], 1.0)
             return
         self._inverse_depths[:, rows] = inverse_depths_around(
             np.take(self._rays, rows, axis=1),
