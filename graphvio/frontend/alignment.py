@@ -11,8 +11,10 @@ from graphvio.frontend.patches import LANES, Lattice, NormalEquations, Patch, we
 from graphvio.frontend.sampling import interpolated_row, spline_weights
 from graphvio.kernels import fast_kernel
 
+SAME_CONTRAST = 1.25
+"""Largest ratio of contrasts of images that are exposed alike."""
+
 _MIN_CONTRAST, _MAX_CONTRAST = 0.4, 2.5  # of an image over that of a patch, as far as it is believed
-_SAME_CONTRAST = 1.25  # a smaller ratio is taken for 1
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken, after which the error is several times smaller
 _ZERO = np.float32(0.0)
@@ -65,7 +67,7 @@ def different_contrast(ratio: float) -> float:
     To estimate it costs precision, which is lost for nothing where both images are exposed alike: a patch that is seen
     larger, or slanted otherwise, seems to have another contrast, too.
     """
-    if 1.0 / _SAME_CONTRAST < ratio < _SAME_CONTRAST:
+    if 1.0 / SAME_CONTRAST < ratio < SAME_CONTRAST:
         return 1.0
     return min(max(ratio, _MIN_CONTRAST), _MAX_CONTRAST)
 

@@ -67,10 +67,10 @@ class KeyframePatches:
         if isinstance(self._group, SingleCamera):
             self._inverse_depths = np.tile(np.maximum(frame.points[:, 2], 0.0), (5, 1))
             before, now = common_rows(ids if motion is not None else ids[:0], frame.ids)
-            if motion is not None and len(before):
-                kept = self._inverse_depths[:, now]
-                hand_on_slants(rays[:, before], inverse_depths[:, before], motion, self._rays[:, now], kept)
-                self._inverse_depths[:, now] = kept
+            if motion is not None:
+                self._inverse_depths[:, now] = hand_on_slants(
+                    rays[:, before], inverse_depths[:, before], motion, self._rays[:, now], self._inverse_depths[0, now]
+                )
             if self._slants is not None:
                 self._slants.hand_on(before, now, len(frame.ids))
             return

@@ -124,7 +124,7 @@ def register(
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel with respect to the target pixel.
         bends: (N, 2, 2) half of the second derivative of the target pixel along the rows of the source, and along its
-            columns, 1/px; the warp is taken for small where it says how far those reach.
+            columns, 1/px. Their effect is computed as if the patch's pixels were as far apart in both images.
         guess: (N, 2) in the target.
         wanted: (N,) which patches to find.
         half: of the patch's side, without its middle.

@@ -113,25 +113,25 @@ class MotionSlants:
         self._parallax_px[rows] = parallax
 
 
-def hand_on_slants(
-    rays: Float, inverse_depths: Float, motion: Float, new_rays: Float, new_inverse_depths: Float
-) -> None:
-    """Slant the patches of a new keyframe as those of the one before, of the same N tracks.
+def hand_on_slants(rays: Float, inverse_depths: Float, motion: Float, new_rays: Float, depths: Float) -> Float:
+    """Compute inverse depths around tracks in a new keyframe, with the slants of the keyframe before.
 
     Args:
         rays: (5, N, 2) normalised coordinates around the tracks before.
         inverse_depths: (5, N) there.
         motion: (4, 4) of points from one keyframe to the other.
         new_rays: (5, N, 2) around the tracks in the new keyframe.
-        new_inverse_depths: (5, N), each patch's the same; changed.
+        depths: (N,) inverse depths of the tracks there.
+
+    Returns:
+        Inverse depths (5, N); a track's own all around it where the surface is seen from its edge.
     """
     planes = _planes(rays, inverse_depths) @ motion[:3, :3].T
     planes /= 1.0 + (planes @ motion[:3, 3])[:, None]
-    depths = (planes * np.column_stack([new_rays[0], np.ones(len(planes))])).sum(axis=1)
+    middle = (planes * np.column_stack([new_rays[0], np.ones(len(planes))])).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        factors = 1.0 + ((new_rays - new_rays[0]) * (planes[:, :2] / depths[:, None])).sum(axis=2)
-    usable = _is_small(factors)
-    new_inverse_depths[:, usable] *= factors[:, usable]
+        factors = 1.0 + ((new_rays - new_rays[0]) * (planes[:, :2] / middle[:, None])).sum(axis=2)
+    return depths * np.where(_is_small(factors), factors, 1.0)
 
 
 def _is_small(factors: Float) -> Bool:

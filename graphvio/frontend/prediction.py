@@ -68,22 +68,26 @@ def predict_warps(
     n = inverse_depths.shape[1]
     warps, bends, valid = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros(n, dtype=np.bool_)
     limit = fold_radius(model, distortion)
-    before, after, forth = np.zeros((5, 2)), np.empty((5, 2)), np.empty((2, 2))
-    before[1, 0], before[2, 0], before[3, 1], before[4, 1] = -step_px, step_px, -step_px, step_px
+    u, v = np.empty(5), np.empty(5)
     for i in range(n):
         all_ok = True
         for k in range(5):
             x, y, z = _moved(rays[k, i, 0], rays[k, i, 1], inverse_depths[k, i], motion)
-            after[k, 0], after[k, 1], ok = _project(x, y, z, limit, model, intrinsics, distortion)
+            u[k], v[k], ok = _project(x, y, z, limit, model, intrinsics, distortion)
             all_ok &= ok
         if not all_ok:
             continue
-        _differentiate(before, after, forth, bends[i])
-        area = forth[0, 0] * forth[1, 1] - forth[0, 1] * forth[1, 0]
+        a, b = (u[2] - u[1]) / (2.0 * step_px), (u[4] - u[3]) / (2.0 * step_px)
+        c, d = (v[2] - v[1]) / (2.0 * step_px), (v[4] - v[3]) / (2.0 * step_px)
+        area = a * d - b * c
         if area < _MIN_AREA:
             continue
-        warps[i, 0, 0], warps[i, 0, 1] = forth[1, 1] / area, -forth[0, 1] / area
-        warps[i, 1, 0], warps[i, 1, 1] = -forth[1, 0] / area, forth[0, 0] / area
+        warps[i, 0, 0], warps[i, 0, 1] = d / area, -b / area
+        warps[i, 1, 0], warps[i, 1, 1] = -c / area, a / area
+        for axis in range(2):
+            first, second = 2 * axis + 1, 2 * axis + 2
+            bends[i, axis, 0] = (0.5 * (u[first] + u[second]) - u[0]) / (step_px * step_px)
+            bends[i, axis, 1] = (0.5 * (v[first] + v[second]) - v[0]) / (step_px * step_px)
         valid[i] = True
     return warps, bends, valid
 
@@ -162,26 +166,6 @@ def _warp_at(x: float, y: float, w: float, ray_by_pixel: Float, camera: _RightCa
         by_y = ray_by_pixel[0, k] * (m[1, 0] - v * m[2, 0]) + ray_by_pixel[1, k] * (m[1, 1] - v * m[2, 1])
         out[0, k], out[1, k] = intrinsics[0] * (a * by_x + b * by_y) / z, intrinsics[1] * (c * by_x + d * by_y) / z
     return bool(a * d - b * c > 0.0 and a > 0.0)
-
-
-@kernel
-def _differentiate(before: Float, after: Float, warp: Float, bends: Float) -> None:
-    """Fill first and halves of second derivatives of a map of pixels from five of them (5, 2), see `around`."""
-    a, b = before[2, 0] - before[1, 0], before[4, 0] - before[3, 0]
-    c, d = before[2, 1] - before[1, 1], before[4, 1] - before[3, 1]
-    area = a * d - b * c
-    for row in range(2):
-        along, across = after[2, row] - after[1, row], after[4, row] - after[3, row]
-        warp[row, 0], warp[row, 1] = (along * d - across * c) / area, (across * a - along * b) / area
-    for axis in range(2):
-        first, second = 2 * axis + 1, 2 * axis + 2
-        mean_x = 0.5 * (before[first, 0] + before[second, 0]) - before[0, 0]
-        mean_y = 0.5 * (before[first, 1] + before[second, 1]) - before[0, 1]
-        step_x, step_y = 0.5 * (before[second, 0] - before[first, 0]), 0.5 * (before[second, 1] - before[first, 1])
-        for row in range(2):
-            mean = 0.5 * (after[first, row] + after[second, row]) - after[0, row]
-            mean -= warp[row, 0] * mean_x + warp[row, 1] * mean_y
-            bends[axis, row] = mean / (step_x * step_x + step_y * step_y)
 
 
 def patch_deviation_px(half: int) -> float:

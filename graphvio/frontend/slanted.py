@@ -9,8 +9,8 @@ see of it. Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_ka
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.alignment import align, different_contrast
-from graphvio.frontend.patches import Lattice, NormalEquations, Patch, correlation, lattice, prepare, room
+from graphvio.frontend.alignment import SAME_CONTRAST, align, different_contrast, shift_by_bends
+from graphvio.frontend.patches import Lattice, Patch, correlation, lattice, prepare, room
 from graphvio.frontend.sampling import Scratch, sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
 
@@ -18,7 +18,6 @@ _MAX_ITERATIONS = 10
 _CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early would bias towards the depth of before
 _CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
 _CONVERGED_SHARE = 0.5  # of such a step that the next one may have, if steps go on getting shorter as they do
-_MIN_GAIN, _MAX_GAIN = 0.8, 1.25  # of images that are exposed alike
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
@@ -58,7 +57,7 @@ def align_slanted(
     found = np.zeros(n, dtype=np.bool_)
     bordered, patch, sheared = room(half + 1), room(half), room(half)
     columns, grid, scratch = (room(half), room(half), room(half), room(half)), lattice(half), scratch_room(half)
-    factor, parameters, step, shift = np.empty((4, 4)), np.empty(4), np.empty(4), np.empty(2)
+    factor, parameters, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     for i in range(n):
         if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
             continue
@@ -70,8 +69,8 @@ def align_slanted(
             parameters[0], parameters[1], _ = align(
                 right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], normal, 0.0, True
             )
+        shift_x, shift_y = shift_by_bends(columns[0], columns[1], grid, normal, bends[i])
         _steepest_descent(columns, grid, ex, ey)
-        _shift_by_bends(columns, normal, ex, ey, bends[i], shift)
         gain, before, is_exposed_alike = 1.0, 0.0, True
         for k in range(_MAX_ITERATIONS):
             if not _sample_sheared(packed_right, parameters, warps[i], directions[i], grid.inside, scratch, sheared):
@@ -84,7 +83,7 @@ def align_slanted(
                     _eliminate_contrast(columns, patch, normal.pp)
                 _factorise(columns, factor)
             if is_exposed_alike:  # what is left of a difference would be taken for slopes
-                gain = min(max(contrast, _MIN_GAIN), _MAX_GAIN)
+                gain = min(max(contrast, 1.0 / SAME_CONTRAST), SAME_CONTRAST)
             _project(columns, sheared, patch, gain, step)
             _solve(factor, step)
             _compose(parameters, step, ex, ey, warps[i])
@@ -94,8 +93,8 @@ def align_slanted(
                 break
             before = size
         if found[i]:
-            parameters[0] -= shift[0]
-            parameters[1] -= shift[1]
+            parameters[0] -= shift_x
+            parameters[1] -= shift_y
             correlations[i] = correlation(patch, sheared)
         moved[i, 0], moved[i, 1] = parameters[0], parameters[1]
         found_slopes[i, 0], found_slopes[i, 1] = parameters[2], parameters[3]
@@ -127,22 +126,6 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
     for k in range(gx.size):
         by_x[k] -= inside[k] * mean_x
         by_y[k] -= inside[k] * mean_y
-
-
-@fast_kernel
-def _shift_by_bends(
-    columns: _Columns, normal: NormalEquations, ex: float, ey: float, bends: Float, shift: Float
-) -> None:
-    """Fill by how much second derivatives of the map (2, 2) shift a patch (2,), as its gradients weigh its pixels."""
-    along2 = ex * ex * normal.xx + 2.0 * ex * ey * normal.xy + ey * ey * normal.yy
-    by_x, by_y = columns[2].flat, columns[3].flat
-    x2 = y2 = np.float32(0.0)
-    for k in range(by_x.size):
-        x2 += by_x[k] * by_x[k]
-        y2 += by_y[k] * by_y[k]
-    share_x, share_y = float(x2) / max(along2, _SHIFT_PRIOR), float(y2) / max(along2, _SHIFT_PRIOR)
-    shift[0] = share_x * bends[0, 0] + share_y * bends[1, 0]
-    shift[1] = share_x * bends[0, 1] + share_y * bends[1, 1]
 
 
 @fast_kernel
