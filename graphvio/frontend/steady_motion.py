@@ -33,7 +33,7 @@ class SteadyMotion:
         """End the step at the measured pose; without one, at the predicted pose."""
         if motion is not None and motion.reference_stamp_ns in self._nav_T_body:
             self._nav_T_now = self._nav_T_body[motion.reference_stamp_ns] @ motion.reference_T_current
-        if self._latest_ns is not None:
-            self._step = se3_inverse(self._nav_T_body[self._latest_ns]) @ self._nav_T_now
+            if self._latest_ns is not None:  # without a measurement it stays: rounding would double with each step
+                self._step = se3_inverse(self._nav_T_body[self._latest_ns]) @ self._nav_T_now
         self._nav_T_body[self._now_ns] = self._nav_T_now
         self._latest_ns = self._now_ns
