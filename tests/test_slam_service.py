@@ -458,7 +458,7 @@ def test_keyframes_of_an_ended_odometry_are_read_to_the_end(odometry: served.Syn
 def test_waiting_estimates_reach_a_slow_reader_after_the_end(odometry: served.SyntheticOdometry) -> None:
     got: list[tuple[int, int]] = []
     may_go_on = threading.Event()
-    published = 2_000
+    published = 0
     server = GrpcServer(odometry, ANY_PORT)
     server.start()
     with Client(server.address, patience_s=0.0) as client:
@@ -470,9 +470,19 @@ def test_waiting_estimates_reach_a_slow_reader_after_the_end(odometry: served.Sy
 
         reader = in_thread(read)
         until(lambda: listeners(odometry.estimates), "nobody listens")
-        for number in range(published):
-            odometry.estimates.publish(replace(served.estimate(1), epoch=number))
-        until(lambda: got, "nothing came")
+        (queue,) = odometry.estimates._queues
+        taken_s = time.monotonic()
+        while time.monotonic() - taken_s < 1.0:  # until the buffers of the connection are full
+            if len(queue):
+                time.sleep(1e-4)
+            else:
+                odometry.estimates.publish(replace(served.estimate(1), epoch=published))
+                published += 1
+                taken_s = time.monotonic()
+        assert got
+        for _ in range(10):
+            odometry.estimates.publish(replace(served.estimate(1), epoch=published))
+            published += 1
         odometry.end()
         assert not server.drain(0.2)
         stopper = in_thread(server.stop)
