@@ -35,7 +35,7 @@ def observed(has_right: bool) -> tuple[StereoPair, Float, Tracks, Float]:
     frames = np.tile(se3_compose(poses[0], pair.left.body_T_cam), (n, 1, 1))
     tracks = Tracks(
         np.zeros(n, dtype=np.int64), frames, np.arange(0, 2 * n + 1, 2), np.tile([0, 1], n), left_px, right_px,
-        np.full(2 * n, has_right),
+        np.full(2 * n, has_right), np.full(2 * n, SIGMA_PX),
     )  # fmt: skip
     bearings, _ = pair.left.unproject(np.ascontiguousarray(left_px[::2]))
     landmarks = np.column_stack([bearings, views[0].inverse_depths[rows[0]]])
@@ -48,7 +48,7 @@ def normal_equations(poses: Float, tracks: Tracks, landmarks: Float) -> tuple[Fl
     calibration, size = RigCalibration.of(default_rig().without_imu().with_pairs([0])), 12 + PAIR
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     eliminate_landmarks(
-        poses, calibration, landmarks, tracks, SIGMA_PX, QUADRATIC, 0.0, hessian, gradient, Eliminated.empty(tracks)
+        poses, calibration, landmarks, tracks, QUADRATIC, 0.0, hessian, gradient, Eliminated.empty(tracks)
     )
     return hessian, gradient
 

@@ -9,6 +9,7 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import RigCalibration
+from graphvio.self_calibration.pixel_noise import noise_of_views
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, choose_tracks, stationary
 
@@ -42,22 +43,27 @@ def adjusted(
     poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
     stamps_s = np.array([(keyframe.stamp_ns - keyframes[0].stamp_ns) * 1e-9 for keyframe in keyframes])
     calibration = nominal.moved(difference[: len(nominal.columns)])
-    tracks, landmarks = choose_tracks(keyframes, poses, calibration, _MAX_TRACKS)
+    tracks, landmarks = choose_tracks(keyframes, poses, calibration, _MAX_TRACKS, sigma_px)
     positions = poses[:, :3, 3]
     velocities = np.gradient(positions, stamps_s, axis=0) if len(poses) > 1 else np.zeros_like(positions)
     states = States(poses, velocities, np.array([0.0, 0.0, -GRAVITY_M_S2]), landmarks)
     if samples is not None:
         samples = samples.without(samples.intervals_with_spikes())
-    solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
+    solution = solve(Window(tracks, samples), states, nominal, difference, prior)
     for _ in range(_MAX_SELECTIONS):
         # Poses are free, and a crowd takes them along: from where they began, the others decide.
         stands = stationary(tracks, solution.errors2)
         if not _CONSENSUS < np.mean(stands) < _ALL:
             break
         tracks, states = tracks.of(stands), states._replace(landmarks=states.landmarks[stands])
-        solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
-    if samples is not None and (solution.imu_errors2 > _MAX_IMU_ERROR2).any():
+        solution = solve(Window(tracks, samples), states, nominal, difference, prior)
+    noise_px = noise_of_views(tracks, solution.errors2)
+    are_some_noisier = not np.array_equal(noise_px, tracks.sigma_px)
+    is_imu_wild = samples is not None and bool((solution.imu_errors2 > _MAX_IMU_ERROR2).any())
+    if samples is not None and is_imu_wild:
         # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
-        believed = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
-        solution = solve(Window(tracks, sigma_px, believed), states, nominal, difference, prior)
+        samples = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
+    if are_some_noisier or is_imu_wild:
+        window = Window(tracks._replace(sigma_px=noise_px), samples)
+        solution = solve(window, states, nominal, difference, prior)
     return solution

@@ -32,6 +32,7 @@ class Tracks(NamedTuple):
         left_px: (N, 2).
         right_px: (N, 2).
         has_right: (N,).
+        sigma_px: (N,) noise of each observation's corners.
     """
 
     pair: Int
@@ -41,6 +42,7 @@ class Tracks(NamedTuple):
     left_px: Float
     right_px: Float
     has_right: Bool
+    sigma_px: Float
 
     def of(self, kept: Bool) -> "Tracks":
         """Return those of the landmarks (L,) that are kept."""
@@ -53,6 +55,7 @@ class Tracks(NamedTuple):
             self.left_px[rows],
             self.right_px[rows],
             self.has_right[rows],
+            self.sigma_px[rows],
         )
 
 
@@ -96,8 +99,8 @@ class Eliminated(NamedTuple):
 
 @vector_kernel
 def eliminate_landmarks(
-    poses: Float, calibration: RigCalibration, landmarks: Float, tracks: Tracks, sigma_px: float, scale: float,
-    damping: float, hessian: Float, gradient: Float, eliminated: Eliminated,
+    poses: Float, calibration: RigCalibration, landmarks: Float, tracks: Tracks, scale: float, damping: float,
+    hessian: Float, gradient: Float, eliminated: Eliminated,
 ) -> tuple[float, Float]:  # fmt: skip
     """Add the normal equations of poses and calibration, landmarks eliminated.
 
@@ -106,7 +109,6 @@ def eliminate_landmarks(
         calibration: of P pairs.
         landmarks: (L, 3).
         tracks: of these.
-        sigma_px: noise of a corner's position.
         scale: of the Cauchy cost, in whitened units.
         damping: of the landmarks' normal matrices, relative.
         hessian: (6 K + P PAIR, 6 K + P PAIR), upper and lower triangle, is added to.
@@ -130,7 +132,7 @@ def eliminate_landmarks(
                 poses[tracks.keyframe[n]], calibration, tracks.pair[point], tracks.odom_T_landmark[point],
                 landmarks[point], tracks.left_px[n], tracks.right_px[n], tracks.has_right[n], scratch, rows,
             )  # fmt: skip
-            cost += _weigh(rows, filled, tracks.has_right[n], sigma_px, scale, weighted, errors2[n])
+            cost += _weigh(rows, filled, tracks.has_right[n], tracks.sigma_px[n], scale, weighted, errors2[n])
             _add(rows, weighted, 6 * tracks.keyframe[n], at, line, hessian, gradient, eliminated.by_pose[n], totals)
         _eliminate(point, at, tracks, totals, damping, of_poses, hessian, gradient, eliminated)
     for c in range(len(gradient)):

@@ -5,18 +5,44 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.self_calibration.bundle import Tracks
 
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
+_MIN_OBSERVATIONS = 10  # of a view, whose noise is judged
+_MIN_EXCESS = 1.5  # of its noise over the one that was assumed
 
 
-def pixel_noise(errors2: Float, sigma_px: float) -> float:
+def pixel_noise(errors2: Float, sigma_px: float | Float) -> float:
     """Return the standard deviation of a corner's position for the next adjustment, px.
 
     Args:
         errors2: squared errors of the views, whitened by the noise that was assumed; NaN where there is no view.
-        sigma_px: noise that was assumed.
+        sigma_px: noise that was assumed, of all or of each.
     """
-    noise = float(np.sqrt(np.nanmedian(errors2))) / _RAYLEIGH_MEDIAN * sigma_px
-    return max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
+    return max(_shown_noise(errors2, sigma_px), _MIN_SIGMA_PX)
+
+
+def noise_of_views(tracks: Tracks, errors2: Float) -> Float:
+    """Return the noise (N,) of each observation, px: where a view shows more than was assumed, its own.
+
+    Over-exposed or blurred images may lie among sharp ones, whose noise is not theirs.
+
+    Args:
+        tracks: with the noise that was assumed.
+        errors2: (N, 2) squared errors, whitened by it; NaN where there is no right image.
+    """
+    noise_px, pair = tracks.sigma_px.copy(), np.repeat(tracks.pair, np.diff(tracks.rows))
+    for j in np.unique(pair):
+        for k in np.unique(tracks.keyframe[pair == j]):
+            of_view = (pair == j) & (tracks.keyframe == k)
+            shown_px = _shown_noise(errors2[of_view], tracks.sigma_px[of_view][:, None])
+            if np.count_nonzero(of_view) >= _MIN_OBSERVATIONS and shown_px > _MIN_EXCESS * noise_px[of_view][0]:
+                noise_px[of_view] = shown_px
+    return noise_px
+
+
+def _shown_noise(errors2: Float, sigma_px: float | Float) -> float:
+    """Return the noise of observations with some whitened errors, px."""
+    return _NOISE_FACTOR * float(np.sqrt(np.nanmedian(errors2 * np.square(sigma_px)))) / _RAYLEIGH_MEDIAN

@@ -51,12 +51,10 @@ class Window(NamedTuple):
 
     Attributes:
         tracks: of all pairs.
-        sigma_px: noise of a corner's position.
         samples: of the IMU, or None.
     """
 
     tracks: Tracks
-    sigma_px: float
     samples: InertialSamples | None
 
 
@@ -67,6 +65,7 @@ class Solution(NamedTuple):
         states: adjusted.
         calibration: posterior of the difference from the nominal calibration.
         errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
+        sigma_px: (N,) noise of a corner's position by which they are whitened.
         imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
         hessian: of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
         has_converged: whether the last step, with next to no damping, hardly changed the calibration; else it is no
@@ -76,6 +75,7 @@ class Solution(NamedTuple):
     states: States
     calibration: Gaussian
     errors2: Float
+    sigma_px: Float
     imu_errors2: Float
     hessian: Float
     has_converged: bool
@@ -142,7 +142,8 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         found = Eliminated.empty(window.tracks)
         at = _linearise(window, states, first, nominal, difference, prior, _MIN_DAMPING, found)
     posterior = Gaussian(difference, _marginal(at.hessian, calibration))
-    return Solution(states, posterior, at.errors2, at.imu_errors2, at.hessian, has_converged)
+    noise_px = window.tracks.sigma_px
+    return Solution(states, posterior, at.errors2, noise_px, at.imu_errors2, at.hessian, has_converged)
 
 
 def _linearise(
@@ -164,7 +165,7 @@ def _linearise(
     visual_hessian, visual_gradient = np.zeros((visual_size, visual_size)), np.zeros(visual_size)
     moved = nominal.moved(difference[:n_camera_parameters])
     cost, errors2 = eliminate_landmarks(
-        states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE, damping,
+        states.poses, moved, states.landmarks, window.tracks, _ROBUST_SCALE, damping,
         visual_hessian, visual_gradient, found,
     )  # fmt: skip
     hessian[cameras, cameras], gradient[cameras] = visual_hessian[np.ix_(columns, columns)], visual_gradient[columns]

@@ -52,7 +52,7 @@ class Keyframe(NamedTuple):
 
 
 def choose_tracks(
-    keyframes: Sequence[Keyframe], poses: Float, calibration: RigCalibration, max_tracks: int
+    keyframes: Sequence[Keyframe], poses: Float, calibration: RigCalibration, max_tracks: int, sigma_px: float
 ) -> tuple[Tracks, Float]:
     """Choose the longest tracks of each pair and single camera whose depth is known, and where their landmarks are.
 
@@ -62,6 +62,7 @@ def choose_tracks(
         calibration: of pairs and single cameras. Those of a pair were matched left to right; the depth of those of a
             single camera comes from the poses.
         max_tracks: of each pair or camera.
+        sigma_px: noise of a corner's position.
 
     Returns:
         The tracks, and the landmarks (L, 3) in their frames.
@@ -104,7 +105,8 @@ def choose_tracks(
         landmarks[of_pair, :2] = _rays(calibration, j, left_px[first[of_pair]])
     landmarks[:, 2] = np.maximum(inverse_depths[first], 0.0)
     odom_T_landmark = poses[keyframe[first]] @ calibration.body_T_left[pair]
-    return Tracks(pair, odom_T_landmark, bounds, keyframe, left_px, right_px, has_right), landmarks
+    noise = np.full(len(keyframe), sigma_px)
+    return Tracks(pair, odom_T_landmark, bounds, keyframe, left_px, right_px, has_right, noise), landmarks
 
 
 def inverse_depths_of_tracks(ids: Int, rays: Float, odom_T_cam: Float) -> tuple[Float, Bool]:
@@ -186,4 +188,5 @@ _NOTHING = Tracks(
     np.zeros((0, 2)),
     np.zeros((0, 2)),
     np.zeros(0, dtype=bool),
+    np.zeros(0),
 )
