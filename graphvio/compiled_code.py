@@ -20,6 +20,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
 from graphvio.kernel_cache import cache_folders
+from graphvio.reference_counts import remove_reference_counts
 
 _STAMP = ""  # numba's own check of the source, which the name of the folder replaces
 _OPTIONS = {
@@ -138,6 +139,7 @@ def _compiler(library: type[JITCodeLibrary], fast_math: frozenset[str]) -> type[
     class _Lower(Lower):  # type: ignore[misc]
         def lower_normal_function(self, fndesc: Any) -> None:
             super().lower_normal_function(fndesc)
+            remove_reference_counts(self.module)
             if fast_math:
                 rewrite_module(self.module, options)
 

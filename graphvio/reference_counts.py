@@ -1,0 +1,51 @@
+"""Kernels without reference counts, where none are needed.
+
+numba counts references to arrays whenever a kernel names one, takes an item of a tuple or a row of a matrix: a call and
+an atomic instruction each, in loops that are a few instructions long. The arrays that a kernel is called with are kept
+by its caller. A kernel that makes no others has nothing to count.
+"""
+
+from llvmlite import ir
+
+_COUNTS = frozenset({"NRT_incref", "NRT_decref"})
+
+
+def remove_reference_counts(module: ir.Module) -> None:
+    """Remove the reference counts of a kernel that owns no arrays; the code of others is not changed.
+
+    Args:
+        module: with the kernel as numba has lowered it, and declarations of what it calls.
+    """
+    blocks = [block for function in module.functions for block in function.blocks]
+    calls = [each for block in blocks for each in block.instructions if isinstance(each, ir.CallInstr)]
+    functions = [function for function in module.functions if function.blocks]
+    if any(map(_returns_array, functions)) or any(_may_own(call.callee) for call in calls):
+        return
+    for block in blocks:
+        block.instructions = [each for each in block.instructions if not _is_count(each)]
+
+
+def _is_count(instruction: ir.Instruction) -> bool:
+    return isinstance(instruction, ir.CallInstr) and instruction.callee.name in _COUNTS
+
+
+def _may_own(callee: ir.Function) -> bool:
+    """Return whether a function allocates memory, or returns an array, which is the caller's then."""
+    if callee.name in _COUNTS:
+        return False
+    return callee.name.startswith("NRT_") or _returns_array(callee)
+
+
+def _returns_array(function: ir.Function) -> bool:
+    """Return whether the result, which numba's functions write to their first argument, has pointers."""
+    arguments = function.function_type.args
+    if not arguments or not isinstance(arguments[0], ir.PointerType):
+        return False
+    result = arguments[0].pointee
+    return isinstance(result, ir.types.Aggregate) and _has_pointer(result)
+
+
+def _has_pointer(kind: ir.Type) -> bool:
+    if isinstance(kind, ir.types.Aggregate):
+        return any(_has_pointer(each) for each in kind.elements)
+    return isinstance(kind, ir.PointerType)
