@@ -10,7 +10,7 @@ from waves import picture, waves
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import build_pyramid, register, track
 from graphvio.frontend.patches import lattice, prepare, room
-from graphvio.frontend.sampling import packed
+from graphvio.frontend.sampling import pixel_words
 
 LEVELS = 4
 
@@ -56,7 +56,7 @@ def test_register_in_an_image_of_another_contrast_hardly_moves(gain: float, offs
     source, target = (darker, texture((0.6, -0.4))) if is_brighter else (texture((-0.6, 0.4)), darker)
     level, everything = np.tile(np.eye(2), (len(grid()), 1, 1)), np.ones(len(grid()), dtype=bool)
     moved, found, _, _ = register(
-        packed(source), target, grid(), level, np.zeros_like(level), grid(), everything, 7, 2.0, 0.5, True
+        pixel_words(source), target, grid(), level, np.zeros_like(level), grid(), everything, 7, 2.0, 0.5, True
     )
     assert found.mean() > 0.9
     assert np.median(np.linalg.norm(moved - grid() - (0.6, -0.4), axis=1)[found]) < 0.03
@@ -78,7 +78,7 @@ def test_track_along_a_blur_is_rejected() -> None:
             sharp, build_pyramid(target, LEVELS), grid(), grid(), window_px=15, levels=1, max_return_px=0.5
         )
         registered, there, _, _ = register(
-            packed(sharp[0]), target, grid(), level, np.zeros_like(level), grid(), everything, 7, 2.0, 0.5, False
+            pixel_words(sharp[0]), target, grid(), level, np.zeros_like(level), grid(), everything, 7, 2.0, 0.5, False
         )
         kept.append((found.mean(), there.mean()))
         for places, good in ((flowed, found), (registered, there)):
@@ -165,7 +165,7 @@ def registered(number: int, assumed: Float, guess_error: Float) -> tuple[Float, 
     for middle, target in deformed(number):
         guess = (PLACE + guess_error)[None]
         moved, ok, _, _ = register(
-            packed(source),
+            pixel_words(source),
             target,
             middle[None],
             assumed[None],
@@ -205,19 +205,19 @@ def test_register_returns_the_guess_where_it_fails() -> None:
     warps, unbent, everything = np.tile(np.eye(2), (n, 1, 1)), np.zeros((n, 2, 2)), np.ones(n, dtype=bool)
     for source, target, wanted in ((image, image, ~everything), (flat, image, everything)):
         moved, found, localised, _ = register(
-            packed(source), target, pixels, warps, unbent, guess, wanted, 7, 2.0, 1.0, False
+            pixel_words(source), target, pixels, warps, unbent, guess, wanted, 7, 2.0, 1.0, False
         )
         np.testing.assert_array_equal(moved, guess)
         assert not found.any()
         assert not localised.any()
     moved, found, localised, _ = register(
-        packed(image), image, pixels, warps, unbent, guess, everything, 7, 2.0, 1.0, False
+        pixel_words(image), image, pixels, warps, unbent, guess, everything, 7, 2.0, 1.0, False
     )
     np.testing.assert_array_equal(found, [True, True, True, False, False, False])
     np.testing.assert_array_equal(localised, found)
     np.testing.assert_array_equal(moved[~found], guess[~found])
     _, found, _, _ = register(
-        packed(image), image, pixels[:3], warps[:3], unbent[:3], guess[:3], everything[:3], 7, 0.1, 1.0, False
+        pixel_words(image), image, pixels[:3], warps[:3], unbent[:3], guess[:3], everything[:3], 7, 0.1, 1.0, False
     )
     assert not found.any()  # they are farther from the guess than that
 

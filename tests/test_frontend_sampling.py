@@ -7,7 +7,7 @@ from scipy.ndimage import map_coordinates
 from graphvio.arrays import Float, Image
 from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.patches import lattice, room
-from graphvio.frontend.sampling import packed, sample, sample_affine, scratch_room
+from graphvio.frontend.sampling import pixel_words, sample, sample_affine, scratch_room
 
 IMAGE: Image = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
 
@@ -29,9 +29,9 @@ def test_sample_equals_a_cubic_spline(half: int) -> None:
 @pytest.mark.parametrize("half", [4, 7, 8])
 def test_sample_affine_equals_a_cubic_spline(half: int) -> None:
     warp, middle = np.array([[1.1, 0.2], [-0.15, 0.9]]), np.array([41.3, 30.6])
-    inside, scratch, out, side = lattice(half).inside, scratch_room(half), room(half), 2 * half + 1
+    grid, out, side = lattice(half), room(half), 2 * half + 1
     a, b, c, d = warp.ravel()
-    assert sample_affine(packed(IMAGE), middle[0], middle[1], a, b, c, d, inside, scratch, out)
+    assert sample_affine(pixel_words(IMAGE), middle[0], middle[1], a, b, c, d, grid, scratch_room(grid), out)
     steps = np.arange(-half, half + 1.0)
     x, y = np.moveaxis(middle + np.stack(np.meshgrid(steps, steps), axis=-1) @ warp.T, -1, 0)
     np.testing.assert_allclose(out.rows[:, :side], spline(x, y), atol=2e-3)  # places in single precision
@@ -43,7 +43,8 @@ def test_sample_beyond_the_edge_returns_false(edge: tuple[int, int]) -> None:
     """As near to each edge as all pixels are there, and a hundredth of a pixel nearer."""
     axis, side = edge
     half, size = 7, IMAGE.shape[1 - axis]
-    out, inside, scratch = room(half), lattice(half).inside, scratch_room(half)
+    out, grid = room(half), lattice(half)
+    scratch = scratch_room(grid)
     for extra, expected in ((0.01, True), (-0.01, False)):
         place = np.array([40.0, 30.0])
         place[axis] = half + 1 + extra if side > 0 else size - half - 2 - extra
@@ -51,7 +52,7 @@ def test_sample_beyond_the_edge_returns_false(edge: tuple[int, int]) -> None:
     for extra, expected in ((2.01, True), (-0.01, False)):  # a deformed patch has two pixels to spare
         place = np.array([40.0, 30.0])
         place[axis] = half + extra if side > 0 else size - 1 - half - extra
-        found = sample_affine(packed(IMAGE), place[0], place[1], 1.0, 0.0, 0.0, 1.0, inside, scratch, out)
+        found = sample_affine(pixel_words(IMAGE), place[0], place[1], 1.0, 0.0, 0.0, 1.0, grid, scratch, out)
         assert found is expected
 
 
@@ -73,7 +74,7 @@ def test_register_at_any_fraction_of_a_pixel_is_unbiased() -> None:
         grid = np.stack(np.meshgrid(np.arange(20.0, 140.0, 12.0), np.arange(20.0, 100.0, 12.0)), axis=-1).reshape(-1, 2)
         pixels, everything = grid + fraction, np.ones(len(grid), dtype=bool)
         moved, found, _, _ = register(
-            packed(image(np.zeros(2))), image(shift), pixels, np.tile(np.eye(2), (len(grid), 1, 1)),
+            pixel_words(image(np.zeros(2))), image(shift), pixels, np.tile(np.eye(2), (len(grid), 1, 1)),
             np.zeros((len(grid), 2, 2)), pixels, everything, 7, 2.0, 1.0, False,
         )  # fmt: skip
         assert found.mean() > 0.9

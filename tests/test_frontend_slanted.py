@@ -6,7 +6,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import register
-from graphvio.frontend.sampling import packed
+from graphvio.frontend.sampling import pixel_words
 from graphvio.frontend.slanted import align_slanted
 
 HALF = 7
@@ -45,7 +45,7 @@ def aligned(
     n = len(guess)
     known, start = np.full(n, slopes is not None), np.zeros((n, 2)) if slopes is None else slopes
     return align_slanted(
-        *images, packed(images[1]), grid(), guess, np.tile(NEARER, (n, 1)), np.tile(np.eye(2), (n, 1, 1)),
+        *images, pixel_words(images[1]), grid(), guess, np.tile(NEARER, (n, 1)), np.tile(np.eye(2), (n, 1, 1)),
         np.zeros((n, 2, 2)), start, known,
         np.ones(n, dtype=bool) if wanted is None else wanted, HALF,
     )  # fmt: skip
@@ -69,10 +69,10 @@ def test_align_slanted_finds_place_and_slopes(slant: tuple[float, float]) -> Non
 @pytest.mark.parametrize("slant", SLANTS[2:])
 def test_align_slanted_without_slopes_is_off_or_fails(slant: tuple[float, float]) -> None:
     images, right = views(*slant), truth(grid(), *slant)
-    n, packed_left = len(right), packed(images[0])
+    n, left_words = len(right), pixel_words(images[0])
     level, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
     shifted, kept, _, _ = register(
-        packed_left, images[1], grid(), level, np.zeros_like(level), right, everything, HALF, 3.0, 1.0, True
+        left_words, images[1], grid(), level, np.zeros_like(level), right, everything, HALF, 3.0, 1.0, True
     )
     moved, _, _, found = aligned(images, right)
     by_shift = np.where(kept, np.linalg.norm(shifted - right, axis=1), np.inf)
@@ -160,7 +160,7 @@ def test_align_slanted_under_a_known_warp_finds_place_and_slopes(slant: tuple[fl
     n = len(straight)
     direction, everything = turn @ NEARER, np.ones(n, dtype=bool)
     moved, slopes, _, found = align_slanted(
-        left, right, packed(right), grid(), expected + np.array([0.4, -0.3]),
+        left, right, pixel_words(right), grid(), expected + np.array([0.4, -0.3]),
         np.tile(direction / np.linalg.norm(direction), (n, 1)), np.tile(turn, (n, 1, 1)), np.zeros((n, 2, 2)),
         np.zeros((n, 2)), ~everything, everything, HALF,
     )  # fmt: skip
@@ -180,7 +180,7 @@ def test_align_slanted_of_a_bent_patch_finds_its_middle() -> None:
             left, right = picture(waves(X, Y, seed)), picture(waves(MIDDLE[0] + from_middle, Y, seed))
             one = np.ones(1, dtype=bool)
             moved, _, _, found = align_slanted(
-                left, right, packed(right), np.array([MIDDLE]), place.copy(), NEARER[None], np.eye(2)[None], bends,
+                left, right, pixel_words(right), np.array([MIDDLE]), place.copy(), NEARER[None], np.eye(2)[None], bends,
                 np.zeros((1, 2)), ~one, one, HALF,
             )  # fmt: skip
             assert found.all()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphvio.arrays import AnyArray, Bool, Float, Image, Int
+from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.matching import TwoCameras
 from graphvio.frontend.motion_slants import MotionSlants, hand_on_slants
 from graphvio.frontend.prediction import around, inverse_depths_around, patch_deviation_px, predict_warps
-from graphvio.frontend.sampling import packed
+from graphvio.frontend.sampling import PixelWords, pixel_words
 from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.rig import CameraGroup, SingleCamera
 
@@ -33,7 +33,7 @@ class KeyframePatches:
         self._half = window_px // 2
         self._step_px = patch_deviation_px(self._half)
         self._frame = TrackedFrame.empty()
-        self._image: AnyArray | None = None  # packed
+        self._image: PixelWords | None = None
         self._rays: Float = np.zeros((5, 0, 2))  # around each of the tracks
         self._inverse_depths: Float = np.zeros((5, 0))
         self._slants: MotionSlants | None = None
@@ -48,10 +48,11 @@ class KeyframePatches:
             image: (height, width) its left image.
             motion: (4, 4) of points since the keyframe before, by which a single camera's slants are handed on.
         """
-        self._image = packed(image)
+        kept = image.copy()  # a driver may fill its buffer again
+        self._image = pixel_words(kept)
         self._place(frame, motion)
         if self._slants is not None:
-            self._slants.begin(image)
+            self._slants.begin(kept)
 
     def recalibrate(self, group: CameraGroup) -> None:
         """Use another calibration of the cameras."""

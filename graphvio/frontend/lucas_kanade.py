@@ -12,10 +12,19 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from graphvio.arrays import AnyArray, Bool, Float, Image
+from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.alignment import align, shift_by_bends
-from graphvio.frontend.patches import correlation, lattice, localisation2, prepare, room, weaker2
-from graphvio.frontend.sampling import sample, sample_affine, scratch_room
+from graphvio.frontend.patches import (
+    bordered_lattice,
+    bordered_room,
+    correlation,
+    lattice,
+    localisation2,
+    prepare,
+    room,
+    weaker2,
+)
+from graphvio.frontend.sampling import PixelWords, sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
 
 MIN_GRADIENT = 1.0
@@ -84,7 +93,7 @@ def _forth_and_back(
     n = len(pixels)
     moved = guess.copy()
     found = np.zeros(n, dtype=np.bool_)
-    bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
+    bordered, patch, seen, gx, gy = bordered_room(half), room(half), room(half), room(half), room(half)
     inside, most2 = lattice(half).inside, _MAX_SIGMA_PX**2
     for i in range(n):
         for level in range(levels - 1, -1, -1):
@@ -113,13 +122,13 @@ def _forth_and_back(
 
 @fast_kernel
 def register(
-    source: AnyArray, target: Image, pixels: Float, warps: Float, bends: Float, guess: Float, wanted: Bool, half: int,
+    source: PixelWords, target: Image, pixels: Float, warps: Float, bends: Float, guess: Float, wanted: Bool, half: int,
     max_shift_px: float, min_gradient: float, is_other_camera: bool,
 ) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
     """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
 
     Args:
-        source: image that holds the patches, as of `graphvio.frontend.sampling.packed`.
+        source: image that holds the patches, as of `graphvio.frontend.sampling.pixel_words`.
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel with respect to the target pixel.
@@ -140,14 +149,23 @@ def register(
     n = len(pixels)
     moved, correlations = guess.copy(), np.full(n, -1.0)
     found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
-    grid, inside_border, scratch = lattice(half), lattice(half + 1).inside, scratch_room(half + 1)
-    most2 = _MAX_SIGMA_PX**2
-    least2 = (min_gradient * (2 * half + 1)) ** 2
+    bordered, patch, seen, gx, gy = bordered_room(half), room(half), room(half), room(half), room(half)
+    grid, bordered_grid = lattice(half), bordered_lattice(half)
+    scratch = scratch_room(bordered_grid)
+    most2, least2 = _MAX_SIGMA_PX**2, (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
         x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]
         if not wanted[i] or not sample_affine(
-            source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], inside_border, scratch, bordered
+            source,
+            x,
+            y,
+            warp[0, 0],
+            warp[0, 1],
+            warp[1, 0],
+            warp[1, 1],
+            bordered_grid,
+            scratch,
+            bordered,
         ):
             continue
         normal = prepare(bordered, grid.inside, patch, gx, gy)

@@ -11,7 +11,7 @@ from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
 from graphvio.frontend.prediction import stereo_warps
-from graphvio.frontend.sampling import pack
+from graphvio.frontend.sampling import pixel_words
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.frontend.tracks import passes, usable_at
@@ -74,7 +74,6 @@ class StereoMatcher:
         self._pair = pair
         self._config = config
         self._allowed = allowed_right
-        self._packed_right = np.zeros(allowed_right.shape, dtype=np.uint32)
         self._margin_px = 0.0  # by how much the calibration may move epipolar lines
         self._shift_px: Float = np.zeros(2)  # of all epipolar lines, where the images show that they are off
 
@@ -155,9 +154,9 @@ class StereoMatcher:
         found = passes(np.ones(len(pixels), dtype=bool), seen & in_reach, "search", rejected)
         half = tracking.window_px // 2
         warps, bends = stereo_warps(rays, expected, pair.right_T_left, *_lens(pair.left), *_lens(pair.right))
-        pack(right[0], self._packed_right)
+        right_words = pixel_words(right[0])
         matched, slopes, correlations, converged = align_slanted(
-            left[0], right[0], self._packed_right, pixels, guess, directions, warps, bends, slopes, known, found, half
+            left[0], right[0], right_words, pixels, guess, directions, warps, bends, slopes, known, found, half
         )
         shift = np.hypot(matched[:, 0] - guess[:, 0], matched[:, 1] - guess[:, 1])
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX + self._margin_px)
@@ -168,7 +167,7 @@ class StereoMatcher:
         localised, returned = np.ones(len(found), dtype=bool), np.ones(len(found), dtype=bool)
         if len(unchecked):
             _, returned[unchecked], localised[unchecked], _ = register(
-                self._packed_right,
+                right_words,
                 left[0],
                 matched[unchecked],
                 warps[unchecked] + directions[unchecked, :, None] * slopes[unchecked, None, :],

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.frontend.prediction import around, inverse_depths_around, stereo_warps
-from graphvio.frontend.sampling import packed
+from graphvio.frontend.sampling import pixel_words
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines
 from graphvio.frontend.tracks import TrackedFrame
@@ -93,7 +93,7 @@ class MotionSlants:
         warps, bends = stereo_warps(middle, depths, motion, *lens, *lens)
         everything = np.ones(n, dtype=bool)
         moved, slopes, correlations, found = align_slanted(
-            self._image, image, packed(image), keyframe.pixels[rows], pixels, directions, warps, bends,
+            self._image, image, pixel_words(image), keyframe.pixels[rows], pixels, directions, warps, bends,
             np.zeros((n, 2)), everything, everything, self._half,
         )  # fmt: skip
         found &= (correlations > _MIN_CORRELATION) & (np.linalg.norm(moved - pixels, axis=1) < _MAX_SHIFT_PX)

@@ -1,7 +1,8 @@
 """Square patches of an image, and how much they resemble each other.
 
 A patch of ``2 half + 1`` pixels on each side has rows that are padded with zeros to a multiple of `LANES`: loops over
-its pixels then run in whole vector registers, and the padding of the image that it is compared with has no weight.
+its pixels then run in whole vector registers, and the padding of the image that it is compared with has no weight. One
+with a border, from which gradients are computed, has rows without padding, or it would be half padding.
 """
 
 from typing import NamedTuple
@@ -25,7 +26,7 @@ class Patch(NamedTuple):
 
     Attributes:
         rows: (side, padded side).
-        flat: the same numbers, row by row.
+        flat: the same numbers, row by row, a multiple of `LANES`.
     """
 
     rows: AnyArray
@@ -55,13 +56,31 @@ def room(half: int) -> Patch:
 
 
 @fast_kernel
+def bordered_room(half: int) -> Patch:
+    """Allocate a patch with one more pixel on each side, all zero: rows without padding, and a register behind them."""
+    side = 2 * half + 3
+    flat = np.zeros((side * side + 2 * LANES - 1) // LANES * LANES, dtype=np.float32)
+    return Patch(flat[: side * side].reshape((side, side)), flat)
+
+
+@fast_kernel
 def lattice(half: int) -> Lattice:
     """Build the lattice of patches of a size."""
-    columns, rows, inside = room(half), room(half), room(half)
+    return _filled(Lattice(room(half), room(half), room(half)), half)
+
+
+@fast_kernel
+def bordered_lattice(half: int) -> Lattice:
+    """Build the lattice of patches of a size with a border."""
+    return _filled(Lattice(bordered_room(half), bordered_room(half), bordered_room(half)), half + 1)
+
+
+@fast_kernel
+def _filled(grid: Lattice, half: int) -> Lattice:
     for j in range(2 * half + 1):
         for i in range(2 * half + 1):
-            columns.rows[j, i], rows.rows[j, i], inside.rows[j, i] = i - half, j - half, 1.0
-    return Lattice(columns, rows, inside)
+            grid.columns.rows[j, i], grid.rows.rows[j, i], grid.inside.rows[j, i] = i - half, j - half, 1.0
+    return grid
 
 
 class NormalEquations(NamedTuple):
@@ -89,18 +108,17 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
     """Fill a patch and its gradients, all of zero mean, and return its normal equations.
 
     Args:
-        bordered: the patch with one more pixel on each side.
+        bordered: the patch with one more pixel on each side, as of `bordered_room`.
         inside: of the patch's `Lattice`.
         patch: output.
         gx: output, along the rows.
         gy: output, along the columns.
     """
     side, stride = patch.rows.shape
-    columns = min(stride, bordered.rows.shape[1] - 2)  # whole registers, as far as the bordered patch reaches
     for j in range(side):
         above, at, below, weights = bordered.rows[j], bordered.rows[j + 1], bordered.rows[j + 2], inside.rows[j]
         values, dx, dy = patch.rows[j], gx.rows[j], gy.rows[j]
-        for i in range(columns):
+        for i in range(stride):  # whole registers: behind a row comes the next one, which has no weight
             values[i] = weights[i] * at[i + 1]
             dx[i] = weights[i] * _HALF * (at[i + 2] - at[i])
             dy[i] = weights[i] * _HALF * (below[i + 1] - above[i + 1])

@@ -11,46 +11,38 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import AnyArray, Image
-from graphvio.frontend.patches import Patch, room
-from graphvio.kernels import fast_kernel, kernel
+from graphvio.frontend.patches import Lattice, Patch
+from graphvio.kernels import fast_kernel
 
 _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 _SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
 _NONE, _EIGHT, _SIXTEEN, _TWENTY_FOUR = np.uint32(0), np.uint32(8), np.uint32(16), np.uint32(24)
 _BYTE = np.uint32(255)
-_BEFORE, _LAST_WORD = np.int32(1), np.int32(2)  # pixels from the first of four to a place, and to the second word
 
 
 class Scratch(NamedTuple):
-    """Intermediate results of `sample_affine`, for each pixel of a patch.
+    """Intermediate results of `sample_affine`, for each of the N pixels of a patch.
 
     Attributes:
-        places: of the upper left one of 4 x 4 pixels in the image's memory.
-        right_of: fraction of a pixel, along the rows, beyond the second of them.
-        below: the same along the columns.
-        upper: the two upper rows of the 4 x 4 pixels, left and right half.
-        lower: the two lower rows.
+        places: (N,) of the upper left one of 4 x 4 pixels in the image's memory.
+        right_of: (N,) fraction of a pixel, along the rows, beyond the second of them.
+        below: (N,) the same along the columns.
+        words: (4, N) the rows of the 4 x 4 pixels.
     """
 
-    places: Patch
-    right_of: Patch
-    below: Patch
-    upper: tuple[Patch, Patch]
-    lower: tuple[Patch, Patch]
+    places: AnyArray
+    right_of: AnyArray
+    below: AnyArray
+    words: AnyArray
 
 
 @fast_kernel
-def _words(half: int) -> Patch:
-    """Allocate one word for each pixel of a patch."""
-    places = np.zeros(room(half).rows.shape, dtype=np.uint32)
-    return Patch(places, places.reshape(-1))
-
-
-@fast_kernel
-def scratch_room(half: int) -> Scratch:
-    """Allocate the intermediate results of `sample_affine`."""
-    upper, lower = (_words(half), _words(half)), (_words(half), _words(half))
-    return Scratch(_words(half), room(half), room(half), upper, lower)
+def scratch_room(grid: Lattice) -> Scratch:
+    """Allocate the intermediate results of `sample_affine` for patches with a lattice."""
+    n = grid.inside.flat.size
+    numbers = np.zeros((2, n), dtype=np.float32)
+    words = np.zeros((5, n), dtype=np.uint32)
+    return Scratch(words[4], numbers[0], numbers[1], words[:4])
 
 
 @fast_kernel
@@ -90,107 +82,80 @@ def interpolated_row(row: Image, i: int, a0: np.float32, a1: np.float32, a2: np.
     return near + a0 * np.float32(row[i]) + a3 * np.float32(row[i + 3])
 
 
-def packed(image: Image) -> AnyArray:
-    """Join each pixel (height, width) with those to its right, below, and to the right below, a byte each.
+class PixelWords(NamedTuple):
+    """An image as words of four pixels in a row, as many as the spline needs of it.
 
-    What the spline needs is then four words. The last row and column are zero.
+    Attributes:
+        words: (height * width - 3,) little-endian, each from the next pixel on; they overlap in the image's memory.
+        height: of the image.
+        width: of the image.
     """
-    words = np.zeros(image.shape, dtype=np.uint32)
-    pack(image, words)
-    return words
+
+    words: AnyArray
+    height: int
+    width: int
 
 
-@kernel
-def pack(image: Image, words: AnyArray) -> None:
-    """Fill the result of `packed`, except the last row and column."""
-    height, width = image.shape
-    for y in range(height - 1):
-        upper, lower, row = image[y], image[y + 1], words[y]
-        for x in range(width - 1):
-            row[x] = (
-                np.uint32(upper[x])
-                | np.uint32(upper[x + 1]) << np.uint32(8)
-                | np.uint32(lower[x]) << np.uint32(16)
-                | np.uint32(lower[x + 1]) << np.uint32(24)
-            )
+def pixel_words(image: Image) -> PixelWords:
+    """Return a view of an image (height, width) as words."""
+    pixels = np.ascontiguousarray(image)
+    words = np.ndarray((pixels.size - 3,), np.dtype("<u4"), pixels.data, strides=(1,))
+    return PixelWords(words, *image.shape)
 
 
 @fast_kernel
 def sample_affine(
-    image: AnyArray, x: float, y: float, xx: float, xy: float, yx: float, yy: float, inside: Patch, scratch: Scratch,
+    image: PixelWords, x: float, y: float, xx: float, xy: float, yx: float, yy: float, grid: Lattice, scratch: Scratch,
     out: Patch,
 ) -> bool:  # fmt: skip
-    """Fill a patch around (x, y) of a `packed` image; False where it leaves the image.
+    """Fill a patch around (x, y); False where it leaves the image.
 
     The columns of ``[[xx, xy], [yx, yy]]`` are the steps in the image from pixel to pixel along the patch's rows and
     columns.
     """
-    height, width = image.shape
-    side, stride = out.rows.shape
-    half = side // 2
+    height, width = image.height, image.width
+    half = len(out.rows) // 2
     reach_x, reach_y = half * (abs(xx) + abs(xy)), half * (abs(yx) + abs(yy))
     if not (reach_x + 2 <= x < width - 3 - reach_x and reach_y + 2 <= y < height - 3 - reach_y):
         return False  # with a pixel to spare for rounding
-    along_x, along_y = np.float32(xx), np.float32(yx)
     # Places are counted from the patch's own corner of the image, where single precision is fine enough.
-    left, top = int(x - reach_x) - 1, int(y - reach_y) - 1
-    flat = image.reshape(-1)[top * width + left :]
+    left, top = max(int(x - reach_x) - 2, 0), max(int(y - reach_y) - 2, 0)
+    middle_x, middle_y = np.float32(x - left - 1), np.float32(y - top - 1)
+    a, b, c, d = np.float32(xx), np.float32(xy), np.float32(yx), np.float32(yy)
     pitch = np.int32(width)
-    last = np.int32(flat.size - 1) - _LAST_WORD * pitch - _LAST_WORD
-    for j in range(side):
-        px = np.float32(x - left - half * xx + xy * (j - half))
-        py = np.float32(y - top - half * yx + yy * (j - half))
-        places, right_of, below = scratch.places.rows[j], scratch.right_of.rows[j], scratch.below.rows[j]
-        for i in range(stride):
-            at_x, at_y = px + along_x * np.float32(i), py + along_y * np.float32(i)
-            x0, y0 = np.int32(at_x), np.int32(at_y)
-            right_of[i], below[i] = at_x - np.float32(x0), at_y - np.float32(y0)
-            place = pitch * (y0 - _BEFORE) + x0 - _BEFORE
-            places[i] = np.uint32(max(min(place, last), np.int32(0)))  # in the padding they mean nothing
-    _gather(flat, width, scratch)
-    _interpolate(scratch, inside, out)
+    columns, rows, places = grid.columns.flat, grid.rows.flat, scratch.places
+    right_of, below = scratch.right_of, scratch.below
+    for k in range(places.size):  # the padding is at the middle of the patch
+        at_x, at_y = middle_x + a * columns[k] + b * rows[k], middle_y + c * columns[k] + d * rows[k]
+        x0, y0 = np.int32(at_x), np.int32(at_y)
+        right_of[k], below[k] = at_x - np.float32(x0), at_y - np.float32(y0)
+        places[k] = np.uint32(pitch * y0 + x0)
+    for row in range(4):  # a loop for each of them: these become vector instructions
+        from_there, words = image.words[(top + row) * width + left :], scratch.words[row]
+        for k in range(places.size):
+            words[k] = from_there[places[k]]
+    _interpolate(scratch, grid.inside, out)
     return True
-
-
-@fast_kernel
-def _gather(flat: AnyArray, width: int, scratch: Scratch) -> None:
-    """Fetch the 4 x 4 pixels of all places, a loop for each word: these become vector instructions."""
-    places = scratch.places.flat
-    left, right = scratch.upper[0].flat, scratch.upper[1].flat
-    for k in range(places.size):
-        left[k] = flat[places[k]]
-    from_there = flat[2:]
-    for k in range(places.size):
-        right[k] = from_there[places[k]]
-    left, right, from_there = scratch.lower[0].flat, scratch.lower[1].flat, flat[2 * width :]
-    for k in range(places.size):
-        left[k] = from_there[places[k]]
-    from_there = flat[2 * width + 2 :]
-    for k in range(places.size):
-        right[k] = from_there[places[k]]
 
 
 @fast_kernel
 def _interpolate(scratch: Scratch, inside: Patch, out: Patch) -> None:
     """Fill a patch from the 4 x 4 pixels of all places."""
-    right_of, below, weights, values = scratch.right_of.flat, scratch.below.flat, inside.flat, out.flat
-    a, b, c, d = scratch.upper[0].flat, scratch.upper[1].flat, scratch.lower[0].flat, scratch.lower[1].flat
+    right_of, below, weights, values = scratch.right_of, scratch.below, inside.flat, out.flat
+    r0, r1, r2, r3 = scratch.words[0], scratch.words[1], scratch.words[2], scratch.words[3]
     for k in range(values.size):
         a0, a1, a2, a3 = spline_weights(right_of[k])
         b0, b1, b2, b3 = spline_weights(below[k])
-        q0, q1 = _rows_of_words(a[k], b[k], a0, a1, a2, a3)
-        q2, q3 = _rows_of_words(c[k], d[k], a0, a1, a2, a3)
+        q0, q1 = _interpolated_word(r0[k], a0, a1, a2, a3), _interpolated_word(r1[k], a0, a1, a2, a3)
+        q2, q3 = _interpolated_word(r2[k], a0, a1, a2, a3), _interpolated_word(r3[k], a0, a1, a2, a3)
         values[k] = weights[k] * (b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3)
 
 
 @fast_kernel
-def _rows_of_words(
-    left: np.uint32, right: np.uint32, a0: np.float32, a1: np.float32, a2: np.float32, a3: np.float32
-) -> tuple[np.float32, np.float32]:
-    """Interpolate the two rows of 2 x 4 pixels, which two words hold."""
-    upper = a0 * _byte(left, _NONE) + a1 * _byte(left, _EIGHT) + a2 * _byte(right, _NONE) + a3 * _byte(right, _EIGHT)
-    lower = a0 * _byte(left, _SIXTEEN) + a1 * _byte(left, _TWENTY_FOUR)
-    return upper, lower + a2 * _byte(right, _SIXTEEN) + a3 * _byte(right, _TWENTY_FOUR)
+def _interpolated_word(word: np.uint32, a0: np.float32, a1: np.float32, a2: np.float32, a3: np.float32) -> np.float32:
+    """Interpolate four pixels of a row."""
+    near = a1 * _byte(word, _EIGHT) + a2 * _byte(word, _SIXTEEN)
+    return near + a0 * _byte(word, _NONE) + a3 * _byte(word, _TWENTY_FOUR)
 
 
 @fast_kernel

@@ -8,10 +8,10 @@ see of it. Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_ka
 
 import numpy as np
 
-from graphvio.arrays import AnyArray, Bool, Float, Image
+from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.alignment import SAME_CONTRAST, align, different_contrast, shift_by_bends
-from graphvio.frontend.patches import Lattice, Patch, correlation, lattice, prepare, room
-from graphvio.frontend.sampling import Scratch, sample, sample_affine, scratch_room
+from graphvio.frontend.patches import Lattice, Patch, bordered_room, correlation, lattice, prepare, room
+from graphvio.frontend.sampling import PixelWords, Scratch, sample, sample_affine, scratch_room
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
@@ -28,7 +28,7 @@ _Columns = tuple[Patch, Patch, Patch, Patch]
 
 @fast_kernel
 def align_slanted(
-    left: Image, right: Image, packed_right: AnyArray, pixels: Float, guess: Float, directions: Float, warps: Float,
+    left: Image, right: Image, right_words: PixelWords, pixels: Float, guess: Float, directions: Float, warps: Float,
     bends: Float, slopes: Float, known: Bool, wanted: Bool, half: int,
 ) -> tuple[Float, Float, Float, Bool]:  # fmt: skip
     """Align patches of the left image in the right one.
@@ -36,7 +36,7 @@ def align_slanted(
     Args:
         left: image (height, width).
         right: image (height, width).
-        packed_right: the right image as of `graphvio.frontend.sampling.packed`.
+        right_words: the right image as of `graphvio.frontend.sampling.pixel_words`.
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) initial pixels in the right image.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
@@ -55,8 +55,9 @@ def align_slanted(
     n = len(pixels)
     moved, found_slopes, correlations = guess.copy(), np.zeros((n, 2)), np.full(n, -1.0)
     found = np.zeros(n, dtype=np.bool_)
-    bordered, patch, sheared = room(half + 1), room(half), room(half)
-    columns, grid, scratch = (room(half), room(half), room(half), room(half)), lattice(half), scratch_room(half)
+    bordered, patch, sheared = bordered_room(half), room(half), room(half)
+    columns, grid = (room(half), room(half), room(half), room(half)), lattice(half)
+    scratch = scratch_room(grid)
     factor, parameters, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     for i in range(n):
         if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
@@ -73,7 +74,7 @@ def align_slanted(
         _steepest_descent(columns, grid, ex, ey)
         gain, before, is_exposed_alike = 1.0, 0.0, True
         for k in range(_MAX_ITERATIONS):
-            if not _sample_sheared(packed_right, parameters, warps[i], directions[i], grid.inside, scratch, sheared):
+            if not _sample_sheared(right_words, parameters, warps[i], directions[i], grid, scratch, sheared):
                 break
             contrast = _contrast(sheared, normal.pp)
             if k == 0:
@@ -132,9 +133,10 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
 def _contrast(sheared: Patch, pp: float) -> float:
     """Return the contrast of the image over that of the patch, given its square."""
     total = square = np.float32(0.0)
-    for value in sheared.flat:
-        total += value
-        square += value * value
+    values = sheared.flat
+    for k in range(values.size):
+        total += values[k]
+        square += values[k] * values[k]
     variance = float(square - total * total / np.float32(len(sheared.rows) ** 2))
     return float(np.sqrt(max(variance, 0.0) / pp))
 
@@ -209,13 +211,13 @@ def _size(step: Float) -> float:
 
 @fast_kernel
 def _sample_sheared(
-    image: AnyArray, parameters: Float, warp: Float, direction: Float, inside: Patch, scratch: Scratch, out: Patch
+    image: PixelWords, parameters: Float, warp: Float, direction: Float, grid: Lattice, scratch: Scratch, out: Patch
 ) -> bool:
     """Sample the patch at the parameters ``[u, v, slope x, slope y]``; False where it leaves the image."""
     u, v, a, b = parameters[0], parameters[1], parameters[2], parameters[3]
     ex, ey = direction[0], direction[1]
     xx, xy, yx, yy = warp[0, 0] + ex * a, warp[0, 1] + ex * b, warp[1, 0] + ey * a, warp[1, 1] + ey * b
-    return sample_affine(image, u, v, xx, xy, yx, yy, inside, scratch, out)
+    return sample_affine(image, u, v, xx, xy, yx, yy, grid, scratch, out)
 
 
 @fast_kernel

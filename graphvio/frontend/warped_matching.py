@@ -13,7 +13,7 @@ from graphvio.frontend.lucas_kanade import Pyramid, register
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH
 from graphvio.frontend.prediction import around, patch_deviation_px, predict_warps
-from graphvio.frontend.sampling import pack
+from graphvio.frontend.sampling import pixel_words
 from graphvio.frontend.stereo import (
     FINE_STEPS,
     HALF_COARSE_PATCH,
@@ -43,9 +43,8 @@ class WarpedMatcher(StereoMatcher):
     """
 
     def __init__(self, pair: TwoCameras, config: Config) -> None:
-        (width, height), (own_width, own_height) = pair.right.size_px, pair.left.size_px
+        width, height = pair.right.size_px
         super().__init__(pair, config, np.ones((height, width), dtype=bool))
-        self._packed_left = np.zeros((own_height, own_width), dtype=np.uint32)
 
     def _search(
         self, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, inverse_depths: Float, slopes: Float,
@@ -70,9 +69,8 @@ class WarpedMatcher(StereoMatcher):
         warps, bends, usable = predict_warps(rays_beside, np.tile(expected, (5, 1)), step_px, *camera)
         guess, _, in_reach = epipolar_lines(rays, expected, *camera)
         found = passes(np.ones(len(pixels), dtype=bool), seen & usable & in_reach, "search", rejected)
-        pack(left[0], self._packed_left)
         matched, registered, localised, correlations = register(
-            self._packed_left, right[0], pixels, warps, bends, guess, found, half, _MAX_SHIFT_PX, min_gradient, True
+            pixel_words(left[0]), right[0], pixels, warps, bends, guess, found, half, _MAX_SHIFT_PX, min_gradient, True
         )
         found = passes(found, registered, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
