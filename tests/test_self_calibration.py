@@ -35,7 +35,7 @@ from graphvio.self_calibration.evidence import (
 )
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
-from graphvio.self_calibration.knock import KnockDetector
+from graphvio.self_calibration.knock import KnockDetector, epipolar_offset_px
 from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, new_scratch, observe
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import (
@@ -484,6 +484,22 @@ class Glare(Walk):
             yield stamp_ns, pose, views
 
 
+class LateRight(Walk):
+    """The first pair's right images are those of the frameset before."""
+
+    def framesets(self, duration_s: float) -> Iterator[tuple[int, Float, dict[int, View]]]:
+        before: View | None = None
+        for stamp_ns, pose, views in super().framesets(duration_s):
+            newest = views[0]
+            if before is not None:
+                _, now, then = np.intersect1d(newest.ids, before.ids, return_indices=True)
+                right_px, has_right = np.zeros_like(newest.right_px), np.zeros_like(newest.has_right)
+                right_px[now], has_right[now] = before.right_px[then], before.has_right[then]
+                views[0] = newest._replace(right_px=right_px, has_right=has_right)
+            before = newest
+            yield stamp_ns, pose, views
+
+
 class Crowd(Walk):
     """A third of all points walks to one side."""
 
@@ -618,6 +634,18 @@ def test_knock_detector_names_the_pair_that_is_off() -> None:
     detector, in_force = KnockDetector(), RigCalibration.of(rig)
     found = [detector.update(views, in_force) for _, _, views in Walk(knocked).framesets(0.5)]
     assert found[:3] == [[], [], [1]]
+
+
+@pytest.mark.parametrize(("scene", "most"), [("room", 0), ("calibration", 1)])
+def test_knock_detector_takes_no_late_camera_for_a_turned_one(scene: str, most: int) -> None:
+    rig = default_rig().without_imu()
+    detector, in_force = KnockDetector(), RigCalibration.of(rig)
+    off_px, knocks = [], 0
+    for _, _, views in list(LateRight(rig, scene=scene).framesets(20.0))[::3]:
+        off_px.append(abs(epipolar_offset_px(views[0], in_force, 0)))
+        knocks += len(detector.update(views, in_force))
+    assert np.mean(np.array(off_px) > 0.25) > 0.8
+    assert knocks <= most  # some 30 and 40 where three keyframes off their lines are enough
 
 
 @pytest.mark.parametrize("level", [0, 2])

@@ -16,6 +16,7 @@ from graphvio.self_calibration.window import View
 _MIN_MATCHES = 30
 _MAX_OFFSET_PX = 0.25  # median; a calibration in force is within a tenth of it
 _CONFIRMED = 3  # keyframes, one after the other
+_MAX_CHANGE = 0.2  # of the offset meanwhile, relative: that of a camera that is late changes as the rig turns
 _TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # what a knock may do to a camera and to a pair
 
 
@@ -23,7 +24,7 @@ class KnockDetector:
     """Watches how far matches are off their epipolar lines, which nothing in the scene can change."""
 
     def __init__(self) -> None:
-        self._off: dict[int, int] = {}  # pair index -> keyframes, one after the other
+        self._off_px: dict[int, list[float]] = {}  # pair index -> offsets at keyframes, one after the other
 
     def update(self, views: Mapping[int, View], calibration: RigCalibration) -> list[int]:
         """Add a keyframe's views.
@@ -31,16 +32,21 @@ class KnockDetector:
         Returns:
             Indices of the pairs whose cameras have been off for so long that they are no longer where they were.
         """
-        off = [j for j, view in views.items() if epipolar_offset_px(view, calibration, j) > _MAX_OFFSET_PX]
-        self._off = {j: self._off.get(j, 0) + 1 for j in off}
-        knocked = [j for j, keyframes in self._off.items() if keyframes >= _CONFIRMED]
+        before, self._off_px = self._off_px, {}
+        for j, view in views.items():
+            offset_px = epipolar_offset_px(view, calibration, j)
+            if abs(offset_px) > _MAX_OFFSET_PX:
+                known_px = before.get(j, [])
+                lasts = all(abs(offset_px - known) <= _MAX_CHANGE * abs(offset_px) for known in known_px)
+                self._off_px[j] = [*(known_px if lasts else []), offset_px]
+        knocked = [j for j, offsets in self._off_px.items() if len(offsets) >= _CONFIRMED]
         if knocked:
-            self._off = {}
+            self._off_px = {}
         return knocked
 
 
 def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float:
-    """Return by how much a pair's matches are off their epipolar lines in the median, 0 where there are few."""
+    """Return how far a pair's matches are beside their epipolar lines in the median, 0 where there are few."""
     matched = view.has_right
     if matched.sum() < _MIN_MATCHES:
         return 0.0
@@ -55,7 +61,7 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
     lines = rays[0] @ (skew(right_T_left[:3, 3]) @ right_T_left[:3, :3]).T
     distances = np.sum(lines * rays[1], axis=1) / np.hypot(lines[:, 0], lines[:, 1])
     scale = central_scale(int(calibration.models[pair, 1]), calibration.distortion[pair, 1])
-    return float(abs(np.median(distances)) * calibration.intrinsics[pair, 1, 0] * scale)
+    return float(np.median(distances) * calibration.intrinsics[pair, 1, 0] * scale)
 
 
 def knock_covariance(rig: Rig, n_parameters: int, groups: Iterable[int]) -> Float:
