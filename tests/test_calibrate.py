@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -243,6 +245,19 @@ def test_calibrate_pairs_crossed_left_right_names_pair(walk: Path) -> None:
     )
     with pytest.raises(CalibrationError, match=r"back measured motion in \d of 120 framesets"):
         calibrate_pairs(open_source(walk, replace(rig, pairs=(rig.pairs[0], crossed))))
+
+
+@pytest.mark.parametrize("lit", [24, 60])
+def test_calibrate_pairs_mostly_dark_pair_is_not_called_wrong(walk: Path, lit: int, tmp_path: Path) -> None:
+    """A pair that is in the dark for half of the walk, or most of it, is as its rig says."""
+    folder = tmp_path / "dark"
+    shutil.copytree(walk, folder)
+    for camera in ("cam2", "cam3"):
+        for image in sorted((folder / "mav0" / camera / "data").iterdir())[lit:]:
+            black = np.zeros_like(cv2.imread(str(image), cv2.IMREAD_GRAYSCALE))
+            assert cv2.imwrite(str(image), black)
+    found = calibrate_pairs(open_source(folder))
+    assert is_plausible(found, load_rig(walk / "rig.yaml"))
 
 
 def test_calibrate_pairs_crossed_pairs_raises(walk: Path) -> None:
