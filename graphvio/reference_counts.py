@@ -1,21 +1,28 @@
 """Kernels without reference counts, where none are needed.
 
-numba counts references to arrays whenever a kernel names one, takes an item of a tuple or a row of a matrix: a call and
-an atomic instruction each, in loops that are a few instructions long. The arrays that a kernel is called with are kept
-by its caller. A kernel that makes no others has nothing to count.
+numba increments and decrements a counter whenever a kernel takes an array out of a tuple, or a row of a matrix: a call
+and an atomic instruction each, in loops that are a few instructions long. Arguments are kept alive by the caller, so
+that a kernel that neither allocates nor returns arrays needs no counting.
+
+This reads the intermediate code that numba makes. Were it to change in a way that this does not see, arrays would be
+freed too soon; kernels of versions of numba that the tests have not been run with therefore keep their counts.
 """
 
+import numba
 from llvmlite import ir
 
+_TESTED = ((0, 61), (0, 68))  # first and last version
 _COUNTS = frozenset({"NRT_incref", "NRT_decref"})
 
 
 def remove_reference_counts(module: ir.Module) -> None:
-    """Remove the reference counts of a kernel that owns no arrays; the code of others is not changed.
+    """Remove the reference counts of a kernel that owns no arrays; one that may own some is left unchanged.
 
     Args:
         module: with the kernel as numba has lowered it, and declarations of what it calls.
     """
+    if not _TESTED[0] <= numba.version_info.short <= _TESTED[1]:
+        return
     blocks = [block for function in module.functions for block in function.blocks]
     calls = [each for block in blocks for each in block.instructions if isinstance(each, ir.CallInstr)]
     functions = [function for function in module.functions if function.blocks]
@@ -37,7 +44,7 @@ def _may_own(callee: ir.Function) -> bool:
 
 
 def _returns_array(function: ir.Function) -> bool:
-    """Return whether the result, which numba's functions write to their first argument, has pointers."""
+    """Return whether a function's result, which numba's write to where their first argument points, has pointers."""
     arguments = function.function_type.args
     if not arguments or not isinstance(arguments[0], ir.PointerType):
         return False

@@ -3,7 +3,8 @@
 The pixels are the spline's coefficients (M. Unser, *Splines: a perfect fit for signal and image processing*, IEEE
 Signal Processing Magazine 16(6), 1999): it smooths by 0.58 pixels, wherever between the pixels a place lies. Bilinear
 interpolation smooths most in the middle between pixels and not at all at them, so that two patches of one surface
-differ by where they lie: their alignment is then off by some 0.03 px, more than by the noise of a good image.
+differ only because they lie at different fractions of a pixel: their alignment is then off by some 0.03 px, more than
+by the noise of a good image.
 """
 
 from typing import NamedTuple
@@ -40,9 +41,9 @@ class Scratch(NamedTuple):
 def scratch_room(grid: Lattice) -> Scratch:
     """Allocate the intermediate results of `sample_affine` for patches with a lattice."""
     n = grid.inside.flat.size
-    numbers = np.zeros((2, n), dtype=np.float32)
-    words = np.zeros((5, n), dtype=np.uint32)
-    return Scratch(words[4], numbers[0], numbers[1], words[:4])
+    fractions = np.zeros((2, n), dtype=np.float32)
+    places, words = np.zeros(n, dtype=np.uint32), np.zeros((4, n), dtype=np.uint32)
+    return Scratch(places, fractions[0], fractions[1], words)
 
 
 @fast_kernel
@@ -85,6 +86,8 @@ def interpolated_row(row: Image, i: int, a0: np.float32, a1: np.float32, a2: np.
 class PixelWords(NamedTuple):
     """An image as words of four pixels in a row, as many as the spline needs of it.
 
+    One instruction fetches such words from sixteen places; fetched byte by byte, sampling took most of the time.
+
     Attributes:
         words: (height * width - 3,) little-endian, each from the next pixel on; they overlap in the image's memory.
         height: of the image.
@@ -125,7 +128,7 @@ def sample_affine(
     pitch = np.int32(width)
     columns, rows, places = grid.columns.flat, grid.rows.flat, scratch.places
     right_of, below = scratch.right_of, scratch.below
-    for k in range(places.size):  # the padding is at the middle of the patch
+    for k in range(places.size):  # padding has coordinates of 0, so it takes the middle
         at_x, at_y = middle_x + a * columns[k] + b * rows[k], middle_y + c * columns[k] + d * rows[k]
         x0, y0 = np.int32(at_x), np.int32(at_y)
         right_of[k], below[k] = at_x - np.float32(x0), at_y - np.float32(y0)

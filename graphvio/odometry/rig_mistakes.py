@@ -20,6 +20,9 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Rig, StereoPair
 
 _CHECKED_AFTER = (10, 100)  # framesets in which few of a pair's corners have a depth
+_CHECKED_AGAIN = (
+    10  # of so many framesets in which more have one, one is checked: a wrong calibration matches some, too
+)
 _FEW_POINTS = 0.3  # of the corners; some always match something
 _MIN_CORNERS = 30
 _MIN_MATCHES = 30
@@ -42,6 +45,7 @@ class RigMistakes:
         self._config = config
         self._report = report
         self._with_few_points: dict[int, int] = dict.fromkeys(self._pairs, 0)  # framesets
+        self._with_more_points: dict[int, int] = dict.fromkeys(self._pairs, 0)  # since a mistake was found
         self._warnings: dict[int, str] = {}
 
     @property
@@ -56,19 +60,28 @@ class RigMistakes:
             if len(seen.pixels) < _MIN_CORNERS:
                 continue
             if seen.points > _FEW_POINTS * len(seen.pixels):
-                self._warnings.pop(j, None)  # somebody has plugged the cables right
+                self._check_again(j, frameset)
                 continue
             self._with_few_points[j] += 1
             if self._with_few_points[j] not in _CHECKED_AFTER or j in self._warnings:
                 continue
-            left, right = (np.ascontiguousarray(image) for image in frameset.images[j])
-            mistakes = self._mistakes(self._pairs[j], left, right)
+            mistakes = self._mistakes(j, frameset)
             if mistakes:
                 self._warnings[j] = f"{self._pairs[j].name}: its images match only if {' or '.join(mistakes)}"
                 self._report(frameset.stamp_ns, EventKind.RIG_MISTAKEN, self._warnings[j])
 
-    def _mistakes(self, pair: StereoPair, left: Image, right: Image) -> list[str]:
+    def _check_again(self, j: int, frameset: FrameSet) -> None:
+        """Withdraw the warning of a pair whose images match as the rig is: somebody has plugged the cables right."""
+        if j not in self._warnings:
+            return
+        if self._with_more_points[j] % _CHECKED_AGAIN == 0 and not self._mistakes(j, frameset):
+            del self._warnings[j]
+        self._with_more_points[j] += 1
+
+    def _mistakes(self, j: int, frameset: FrameSet) -> list[str]:
         """Return the mistakes without which the images match. They may be the same, where body has a camera's axes."""
+        pair = self._pairs[j]
+        left, right = (np.ascontiguousarray(image) for image in frameset.images[j])
         n_as_it_is = self._matches(pair, left, right)
         n_undone = {_EXCHANGED: self._matches(pair, right, left)}
         inverted = _inverted(pair)

@@ -1,4 +1,4 @@
-"""Adjustment of one window of keyframes: what the tracks and IMU samples that agree say of poses and calibration."""
+"""Adjustment of one window of keyframes: poses and calibration from the tracks and IMU samples that are no outliers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, choose_tracks, stationary
 
 _MAX_TRACKS = 150  # of each pair
-_MAX_SELECTIONS = 2  # of the landmarks that stand still
-_CONSENSUS, _ALL = 0.5, 0.98  # shares of them, between which the others are left out
+_MAX_SELECTIONS = 2  # how often landmarks that move are left out
+_MIN_STATIONARY, _ALL_STATIONARY = 0.5, 0.98  # they are if the share of those that stand still is between these
 _MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 
 
@@ -38,7 +38,7 @@ def adjusted(
         sigma_px: noise of a corner's position.
 
     Returns:
-        States, calibration and their covariance, without landmarks that move and samples that are wild.
+        States, calibration and their covariance, without landmarks that move and outliers among the samples.
     """
     poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
     stamps_s = np.array([(keyframe.stamp_ns - keyframes[0].stamp_ns) * 1e-9 for keyframe in keyframes])
@@ -51,19 +51,18 @@ def adjusted(
         samples = samples.without(samples.intervals_with_spikes())
     solution = solve(Window(tracks, samples), states, nominal, difference, prior)
     for _ in range(_MAX_SELECTIONS):
-        # Poses are free, and a crowd takes them along: from where they began, the others decide.
         stands = stationary(tracks, solution.errors2)
-        if not _CONSENSUS < np.mean(stands) < _ALL:
+        if not _MIN_STATIONARY < np.mean(stands) < _ALL_STATIONARY:
             break
+        # From the first poses again: a crowd has taken those that were found along.
         tracks, states = tracks.of(stands), states._replace(landmarks=states.landmarks[stands])
         solution = solve(Window(tracks, samples), states, nominal, difference, prior)
-    noise_px = noise_of_views(tracks, solution.errors2)
-    are_some_noisier = not np.array_equal(noise_px, tracks.sigma_px)
-    is_imu_wild = samples is not None and bool((solution.imu_errors2 > _MAX_IMU_ERROR2).any())
-    if samples is not None and is_imu_wild:
-        # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
-        samples = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
-    if are_some_noisier or is_imu_wild:
+    # Errors that have no minimum yet do not show noise, but a rig that is wrong beyond what is estimated.
+    noise_px = noise_of_views(tracks, solution.errors2) if solution.has_converged else tracks.sigma_px
+    outliers = np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2)  # single samples, or an axis that sticks
+    if samples is not None and len(outliers):
+        samples = samples.without(outliers)
+    if len(outliers) or not np.array_equal(noise_px, tracks.sigma_px):
         window = Window(tracks._replace(sigma_px=noise_px), samples)
         solution = solve(window, states, nominal, difference, prior)
     return solution

@@ -14,42 +14,43 @@ from graphvio.self_calibration.parameters import STEREO, RigCalibration, extrins
 from graphvio.self_calibration.window import View
 
 _MIN_MATCHES = 30
-_MAX_OFFSET_PX = 0.25  # median; a calibration in force is within a tenth of it
+_MAX_OFFSET_PX = 0.25  # median; a calibration in force is off by a tenth of it
 _CONFIRMED = 3  # keyframes, one after the other
-_MAX_CHANGE = 0.2  # of the offset meanwhile, relative: that of a camera that is late changes as the rig turns
+_MAX_CHANGE = 0.2  # relative, between these keyframes: a turned camera's offset stays, a late camera's does not
 _TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # what a knock may do to a camera and to a pair
 
 
 class KnockDetector:
-    """Watches how far matches are off their epipolar lines, which nothing in the scene can change."""
+    """Watches how far matches are off their epipolar lines, which no scene changes, whether it moves or not."""
 
     def __init__(self) -> None:
-        self._off_px: dict[int, list[float]] = {}  # pair index -> offsets at keyframes, one after the other
+        self._off_px: dict[int, list[float]] = {}  # pair index -> offsets at its newest keyframes, one after the other
 
     def update(self, views: Mapping[int, View], calibration: RigCalibration) -> list[int]:
         """Add a keyframe's views.
 
         Returns:
-            Indices of the pairs whose cameras have been off for so long that they are no longer where they were.
+            Indices of the pairs whose offset has lasted for three of their keyframes: they are not where they were.
         """
-        before, self._off_px = self._off_px, {}
         for j, view in views.items():
             offset_px = epipolar_offset_px(view, calibration, j)
+            if offset_px is None:
+                continue
+            known_px = self._off_px.pop(j, [])
             if abs(offset_px) > _MAX_OFFSET_PX:
-                known_px = before.get(j, [])
                 lasts = all(abs(offset_px - known) <= _MAX_CHANGE * abs(offset_px) for known in known_px)
-                self._off_px[j] = [*(known_px if lasts else []), offset_px]
+                self._off_px[j] = [*known_px, offset_px] if lasts else [offset_px]
         knocked = [j for j, offsets in self._off_px.items() if len(offsets) >= _CONFIRMED]
-        if knocked:
-            self._off_px = {}
+        for j in knocked:
+            del self._off_px[j]
         return knocked
 
 
-def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float:
-    """Return how far a pair's matches are beside their epipolar lines in the median, 0 where there are few."""
+def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float | None:
+    """Return how far a pair's matches are beside their epipolar lines in the median, None where there are few."""
     matched = view.has_right
     if matched.sum() < _MIN_MATCHES:
-        return 0.0
+        return None
     rays = []
     for which, pixels in enumerate((view.left_px, view.right_px)):
         normalised, _ = unproject_pixels(
@@ -67,7 +68,7 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
 def knock_covariance(rig: Rig, n_parameters: int, groups: Iterable[int]) -> Float:
     """Return the covariance (C, C) of what a knock does to some pairs and single cameras.
 
-    It turns and shifts cameras, and leaves lenses and IMU. A housing bends; its length, and so the baseline, stays.
+    It turns and shifts cameras; lenses, the IMU and the length of a baseline stay.
     """
     variances = np.zeros(n_parameters)
     for j in groups:

@@ -10,8 +10,8 @@ from graphvio.self_calibration.bundle import Tracks
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_OBSERVATIONS = 10  # of a view, whose noise is judged
-_MIN_EXCESS = 1.5  # of its noise over the one that was assumed
+_MIN_OBSERVATIONS = 10  # of a view, before its noise is judged
+_MIN_EXCESS = 1.5  # ratio of the noise that a view shows to the one that was assumed
 
 
 def pixel_noise(errors2: Float, sigma_px: float | Float) -> float:
@@ -26,9 +26,10 @@ def pixel_noise(errors2: Float, sigma_px: float | Float) -> float:
 
 
 def noise_of_views(tracks: Tracks, errors2: Float) -> Float:
-    """Return the noise (N,) of each observation, px: where a view shows more than was assumed, its own.
+    """Return the noise (N,) of each observation, px.
 
-    Over-exposed or blurred images may lie among sharp ones, whose noise is not theirs.
+    A view, what one pair or camera sees at one keyframe, whose residuals show clearly more noise than was assumed gets
+    its own: over-exposed and blurred images lie among sharp ones.
 
     Args:
         tracks: with the noise that was assumed.
@@ -37,7 +38,8 @@ def noise_of_views(tracks: Tracks, errors2: Float) -> Float:
     view = np.repeat(tracks.pair, np.diff(tracks.rows)) * (1 + tracks.keyframe.max(initial=0)) + tracks.keyframe
     squares = errors2 * np.square(tracks.sigma_px)[:, None]
     shown_px = _NOISE_FACTOR * np.sqrt(_medians(squares.ravel(), np.repeat(view, 2))) / _RAYLEIGH_MEDIAN
-    is_noisier = (shown_px[view] > _MIN_EXCESS * tracks.sigma_px) & (np.bincount(view)[view] >= _MIN_OBSERVATIONS)
+    is_judged = np.bincount(view)[view] >= _MIN_OBSERVATIONS
+    is_noisier = is_judged & (shown_px[view] > _MIN_EXCESS * tracks.sigma_px)
     return np.where(is_noisier, shown_px[view], tracks.sigma_px)
 
 
