@@ -11,6 +11,7 @@ from monte_carlo import band
 
 from graphvio.arrays import Float
 from graphvio.calibration import graph, paper_method
+from graphvio.calibration.alignment import alignment_errors_of
 from graphvio.calibration.comparison import compare
 from graphvio.calibration.consistency import whitened
 from graphvio.calibration.paper_method import PoseParts
@@ -79,7 +80,11 @@ def test_alignment_errors_are_distances_of_second_camera() -> None:
     left1_T_left2 = np.linalg.inv(LEFT2_T_LEFT1)
     by_1, by_2 = pairs.motion_1 @ left1_T_left2, left1_T_left2 @ pairs.motion_2
     expected = by_1[:, :3, 3] - by_2[:, :3, 3]
-    np.testing.assert_allclose(paper_method.alignment_errors(PoseParts.of(pairs), R, t), expected, atol=1e-12)
+    parts = PoseParts.of(pairs)
+    np.testing.assert_allclose(paper_method.alignment_errors(parts, R, t), expected, atol=1e-12)
+    moved = np.einsum("nji,nj->ni", parts.R_2, parts.T_2)
+    by_kernel = alignment_errors_of(parts.R_1, parts.T_1, moved, np.ascontiguousarray(R), t)
+    np.testing.assert_allclose(by_kernel, expected, atol=1e-12)
 
 
 def test_costs_of_triples_are_the_sums_of_limited_distances() -> None:

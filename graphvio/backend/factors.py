@@ -82,9 +82,10 @@ def _length_error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: l
 def constant_velocity(
     i: int, j: int, motion: Float, dt: float, after_s: float, rate_sigmas: Float, accel_sigmas: Float
 ) -> gtsam.NonlinearFactor:
-    """Return a factor of constant velocity and angular rate between two states (eq. 11 and 12).
+    """Return a factor between two states that continue at constant velocity and angular rate (eq. 11 and 12).
 
-    Its noise is that of unknown accelerations that stay constant since the motion was last measured.
+    The motion is that of `graphvio.backend.smoother.Smoother.extend`, which repeats the one before. The paper's noise
+    is that of one step; this one is of unknown accelerations that stay constant since the motion was last measured.
 
     Args:
         i: a state.

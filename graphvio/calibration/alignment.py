@@ -12,7 +12,7 @@ from graphvio.linear_algebra import squared_length
 
 @kernel
 def alignment_errors_of(R_1: Float, T_1: Float, moved: Float, R: Float, t: Float) -> Float:
-    """Compute alignment errors (N, 3), metres.
+    """Compute alignment errors (N, 3), metres: `graphvio.calibration.paper_method.alignment_errors` as a kernel.
 
     Args:
         R_1: (N, 3, 3).
@@ -36,6 +36,8 @@ def squared_lengths_of(
     errors: Float, R_1: Float, covariance_1: Float, covariance_2: Float, R: Float, t: Float
 ) -> Float:
     """Compute squared Mahalanobis distances (N,) of alignment errors (N, 3) from zero.
+
+    Their covariance is ``B S_1 B^T + R^T S_2 R`` with ``B = R_1^T [-[t]_x, I]``.
 
     Args:
         errors: (N, 3).

@@ -1,8 +1,12 @@
-"""The paper's calibration of P_12 (section 4), step by step.
+"""The paper's calibration of P_12 (section 4), step by step, and what makes it robust to noise.
 
 ``P_12 P_1(k) = P_2(k) P_12`` gives eq. (5) for the rotation and eq. (6) for the translation. RANSAC over minimal sets
 of three pose pairs finds the rotation as an eigenvector, eq. (8) and (9), then the translation by least squares, eq.
 (10); Levenberg-Marquardt minimises the alignment error, eq. (7), on the inliers.
+
+The paper does not say how solutions are compared, and takes the best one as it is. Here their costs weigh the alignment
+errors by the covariances of the motions, the ten best are refined on their inliers, and directions in which rotations
+determine nothing beyond their noise are left out.
 
 ``R_1, T_1`` and ``R_2, T_2`` are the paper's: ``P_j(k)`` maps points from the start to the end of a motion.
 """
@@ -10,7 +14,7 @@ of three pose pairs finds the rotation as an eigenvector, eq. (8) and (9), then 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -139,7 +143,8 @@ def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
     Each is the vector between the centres of the second camera at the end of a motion, as both cameras' motions predict
     it, in the frame of the first camera at the beginning; ``t = -R^T T`` is that centre in the first camera's frame.
     """
-    return alignment_errors_of(parts.R_1, parts.T_1, _moved(parts), np.ascontiguousarray(R), t)
+    R_1_t = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)  # R_1^T (t - T_1)
+    return np.asarray(_moved(parts) @ R + R_1_t - t)
 
 
 def _moved(parts: PoseParts) -> Float:
@@ -266,12 +271,13 @@ def _normal_matrices(R_1: Float, R_2: Float) -> Float:
     Quaternions with a positive real part have signs that agree, as both rotations turn by the same angle.
     """
     q_1, q_2 = (np.array([quat_wxyz_from_rotation(np.ascontiguousarray(R)) for R in each]) for each in (R_1, R_2))
-    C = _product_matrices(q_1, -1.0) - _product_matrices(q_2, 1.0)
+    C = _product_matrices(q_1, "right") - _product_matrices(q_2, "left")
     return np.asarray(np.swapaxes(C, 1, 2) @ C)
 
 
-def _product_matrices(quats_wxyz: Float, sign: float) -> Float:
-    """Matrices (N, 4, 4) of the product with quaternions from the left (sign 1) or from the right (sign -1)."""
+def _product_matrices(quats_wxyz: Float, side: Literal["left", "right"]) -> Float:
+    """Matrices (N, 4, 4) of the product with quaternions from the left or from the right."""
+    sign = 1.0 if side == "left" else -1.0
     made = np.empty((len(quats_wxyz), 4, 4))
     w, v = quats_wxyz[:, 0], quats_wxyz[:, 1:]
     made[:, 0, 0], made[:, 0, 1:], made[:, 1:, 0] = w, -v, v

@@ -1,8 +1,8 @@
 """Slant of the surfaces that a single camera sees, from how a keyframe's patches look after a motion.
 
 The keyframe and a later image are a stereo pair whose baseline is the motion: the patch of a slanted surface is sheared
-along the epipolar line. Taken for surfaces that face the camera, patches would seem to move along with what is
-sheared, all of a wall alike.
+along the epipolar line. Where the slant is ignored, the shear is taken for a shift, in the same direction all over a
+wall.
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ class MotionSlants:
     def begin(self, image: Image) -> None:
         """Begin with another keyframe: its image (height, width)."""
         self._image = image
+        # so that the first measurement needs the smallest parallax
         self._parallax_px = np.full(len(self._variances), _MIN_PARALLAX_PX / _MORE_PARALLAX)
 
     def hand_on(self, before: Int, now: Int, n_tracks: int) -> None:
-        """Keep what is known of K tracks' slants, in rows (K,) before and now, and know nothing of the others'."""
+        """Keep the variances of K tracks' slants, in rows (K,) before and now; the other slants are unknown."""
         variances = np.ones(n_tracks)
         variances[now] = self._variances[before]
         self._variances = variances
@@ -64,8 +65,8 @@ class MotionSlants:
     ) -> None:  # fmt: skip
         """Improve inverse depths around the patches whose slant an image shows better than those before.
 
-        A patch that has not moved far against others hardly shows a slant, and what noise makes of it is larger than
-        a usual one: what is measured counts by its variance.
+        A slant that is measured with little parallax is noisier than a usual slant is large: it is weighed by its
+        variance.
 
         Args:
             camera: of all images.

@@ -41,7 +41,7 @@ class VisualFrontend(TrackingFrontend):
     """Tracks every pair and estimates the rig's motion since a reference frameset (sections 2 and 3).
 
     Args:
-        rig: Stereo pairs.
+        rig: Stereo pairs, and single cameras beside them.
         config: Configuration of all stages.
         image_mask: Masks of each image, or None.
 
@@ -52,8 +52,8 @@ class VisualFrontend(TrackingFrontend):
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         super().__init__(rig, config, image_mask)
         self._baselines_m = _baselines_m(rig)
-        # Errors of focal lengths and baselines scale all motions alike. No residual shows that, and an IMU must not be
-        # corrected by it; without an IMU nothing shows the scale, and as noise it would only be smoothed.
+        # Wrong focal lengths and baselines scale all motions by one factor, which no residual shows. With an IMU it is
+        # added to the covariance, so that vision does not correct the IMU by it; without one nothing shows the scale.
         file_error_share = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
         error_share = float(np.hypot(config.motion.shared_error_share, file_error_share))
         self._scale_sigma = 0.0 if rig.imu is None else error_share
@@ -109,23 +109,20 @@ class VisualFrontend(TrackingFrontend):
         """Estimate the motion from all pairs, eq. (1) to (4), or return None and why there is none."""
         if not seen.reference:
             return None, seen.frozen.reason if self._all_frozen or not seen.frames else "first images"
-        config, observations = self._config.motion, seen.correspondences.observations
+        config, observations, arrays = self._config.motion, seen.correspondences.observations, self._extrinsics.arrays
         if len(observations.pair) < config.min_inliers:
             return None, f"only {len(observations.pair)} points in view"
         rng = np.random.default_rng([config.seed, seen.stamp_ns % 2**63])
         predicted = motion_since(seen.reference_stamp_ns)
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
-            arrays = self._extrinsics.arrays
             refined, observations = joint_motion(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
-            agreement = agree(
-                self._extrinsics.arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt
-            )
+            agreement = agree(arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt)
             if agreement.contradicts:
                 self._contradicted_ns = seen.stamp_ns
         else:
-            refined = best_pair_motion(self._extrinsics.arrays, observations, start, config, rng)
+            refined = best_pair_motion(arrays, observations, start, config, rng)
             agreement = Agreement((MotionHypothesis(observations.pairs, refined),), {})
         best = agreement.hypotheses[0]
         rows = np.isin(observations.pair, best.pairs)
@@ -176,7 +173,9 @@ class VisualFrontend(TrackingFrontend):
     def _start_keyframe_if_due(
         self, seen: TrackedFrameset, agreement: Agreement | None, motion_since: MotionPredictor
     ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
-        """Start a keyframe with new corners if it is time to, with what the one that ends has shown.
+        """Start a keyframe with new corners if one is due, or if there is no motion.
+
+        The keyframe that ends corrects where the pairs are to each other, if they have shown it.
 
         Returns:
             Pair index -> tracks with new corners, and pair index -> its own motion over the keyframe; empty where the
@@ -197,7 +196,7 @@ class VisualFrontend(TrackingFrontend):
 
     def _advance_histories(self, seen: TrackedFrameset, refined: Refined, motion_since: MotionPredictor) -> None:
         """Note the motion over the keyframe that ends, by which single cameras locate points."""
-        # Depths by a motion of single cameras alone would have the scale of earlier depths: that of the state is known.
+        # A motion that single cameras alone have measured has the scale of earlier depths; the state's is better known.
         are_singles = is_of_singles(self._extrinsics.arrays, seen.correspondences.observations, refined)
         predicted = motion_since(seen.reference_stamp_ns) if are_singles else None
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
@@ -236,7 +235,7 @@ class VisualFrontend(TrackingFrontend):
         )
 
     def _with_depth_errors(self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined) -> RelativeMotion:
-        """Add the derivatives by errors of the pairs' depths, by which an IMU may contradict the motion."""
+        """Add derivatives with respect to errors of the pairs' depths, which the innovation test needs."""
         if not self._config.estimates_calibration or self._rig.imu is None:
             return motion
         observations, cur_T_ref = seen.correspondences.observations, np.ascontiguousarray(refined.cur_T_ref)
@@ -247,12 +246,11 @@ class VisualFrontend(TrackingFrontend):
         """Return each pair's own motion without the corrections in force; with one pair alone, that is the rig's."""
         first = agreement.hypotheses[0]
         alone = {first.pairs[0]: first.refined} if len(self._rig.groups) == 1 else {}
-        motions = {}
-        for j, refined in (agreement.own or alone).items():
-            if j >= len(self._rig.pairs):
-                continue
-            motions[j] = self._relative_motion(seen, self._extrinsics.uncorrected(j, refined))
-        return motions
+        return {
+            j: self._relative_motion(seen, self._extrinsics.uncorrected(j, refined))
+            for j, refined in (agreement.own or alone).items()
+            if j < len(self._rig.pairs)
+        }
 
 
 def _baselines_m(rig: Rig) -> list[float]:

@@ -58,12 +58,12 @@ from graphvio.timing import timed
 
 
 class _Predicted(NamedTuple):
-    """How the state came to a frameset's instant."""
+    """How the state at a frameset's instant was obtained."""
 
     stamp_ns: int
     is_initial: bool  # initialised there, not predicted
     interval: ImuInterval | None
-    initialisations: int  # until then
+    initialisations: int  # number of them before it
 
 
 def _check_config(rig: Rig, config: Config) -> None:
@@ -180,8 +180,8 @@ class Odometry:
     def process_due(self) -> Estimate | None:
         """Process the oldest held frameset that is due.
 
-        Call it after `process` until it returns None where several framesets may become due at once and later
-        measurements should not be waited for.
+        `process` handles at most one frameset a call. To handle all that are due at once, call this until it returns
+        None.
 
         Returns:
             Its estimate, or None if no frameset is due.
@@ -230,9 +230,9 @@ class Odometry:
             stamp_ns: On the framesets' clock: an IMU sample's stamp less the rig's time offset.
 
         Returns:
-            None before the first pose and while lost, before the newest estimate's instant, and more than
-            ``timing.max_prediction_ms`` beyond the newest sample (without an IMU, the newest estimate); after a gap of
-            the samples and after 5 s without a frameset, until the next one.
+            The state, or None: before the first pose, and while lost; for an instant before the newest estimate; for
+            one more than ``timing.max_prediction_ms`` beyond the newest sample (without an IMU, the newest estimate);
+            and after a gap in the samples, or 5 s without a frameset, until the next one.
         """
         return self._propagator.predict(stamp_ns)
 
@@ -292,7 +292,7 @@ class Odometry:
         self._calibration.on_full_window(on_window)
 
     def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
-        """Register a function that gets the views of landmarks by a rig of single cameras only, each of them once.
+        """Register a function that gets each view of a landmark once, of rigs of single cameras only.
 
         Args:
             on_views: called within `process` and `finish`, when landmarks leave the window; and once in an epoch with
@@ -311,11 +311,11 @@ class Odometry:
             ConfigError: If it is no such share.
         """
         if not 0.0 < share <= 1.0:
-            raise ConfigError(f"a share of {share} of the corners cannot be followed; give more than 0, and at most 1")
+            raise ConfigError(f"share of the corners: is {share}; give more than 0, and at most 1")
         self._frontend.limit_corners(share)
 
     def subscribe(self, on_step: Callable[[Step], None], on_finish: Callable[[], None] | None = None) -> None:
-        """Call functions with what becomes of each frameset, in the thread that calls `process`: they should be quick.
+        """Register functions that are called after each frameset, in the thread that calls `process`: keep them short.
 
         Args:
             on_step: Takes each step from now on, before its estimate is returned.
@@ -412,7 +412,7 @@ class Odometry:
     def _watch_clocks(
         self, frameset: FrameSet, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate
     ) -> None:
-        """Leave the IMU out while it contradicts vision, and let the time offsets follow."""
+        """Leave the IMU out while it contradicts vision, and update the time offsets."""
         stamp_ns = predicted.stamp_ns
         is_imu_changed = self._imu.watch(stamp_ns, predicted.interval, visual, applied.motion)
         if is_imu_changed:
@@ -490,12 +490,13 @@ class Odometry:
     def _add_sample(self, sample: ImuSample) -> None:
         """Hand on a sample, and the prediction at it to those who asked for it; by vision where the IMU is left out."""
         stamp_ns, values = self._synchroniser.corrected(sample)
-        is_next = self._imu.is_left_out
-        if not is_next:
+        if self._imu.is_left_out:
+            is_predicted = True
+        else:
             self._calibration.add_sample(sample)
             self._estimator.add_sample(stamp_ns, values)
-            is_next = self._propagator.add(stamp_ns, values)
-        if is_next and self._on_prediction is not None:
+            is_predicted = self._propagator.add(stamp_ns, values)
+        if is_predicted and self._on_prediction is not None:
             prediction = self._propagator.predict(stamp_ns)
             if prediction is not None:
                 self._on_prediction(prediction)
