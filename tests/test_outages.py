@@ -180,6 +180,28 @@ def test_a_blackout_is_coasted_through(
     assert not {"lost", "new_epoch", "gate_reset", "window_rebuilt"} & set(done.kinds)
 
 
+@pytest.mark.parametrize("frameset", [blackened, lambda _: None], ids=["dark", "cable"])
+def test_an_imu_that_led_off_in_the_dark_is_corrected_and_kept(
+    walk_folder: Path, long_measurements: list[Measurement], frameset: Callable[[FrameSet], FrameSet | None]
+) -> None:
+    """Its force is off by more than its noise explains, as of a wrong scale and axes; then images are back."""
+    off, end_s = np.array([0.4, 0.2, 0.0]), START_S + 1.7
+
+    def misled(sample: ImuSample) -> ImuSample:
+        return replace(sample, linear_acceleration=sample.linear_acceleration + off)
+
+    done = outcome(walk_folder, altered(until(long_measurements, end_s + 2.5), START_S, end_s, frameset, misled))
+    assert "gate_reset" in done.kinds
+    assert not {"imu_left_out", "lost", "new_epoch"} & set(done.kinds)
+    assert done.recovery_s(end_s) <= 0.3
+    after = done.at(end_s + 2.0)
+    assert after.status is Status.TRACKING
+    assert after.covariance is not None
+    sigma = np.sqrt(np.trace(after.covariance[3:, 3:]))
+    assert 0.1 < done.error_m(START_S - PERIOD_S, end_s + 2.0) < 3.0 * sigma
+    assert done.error_m(end_s + 0.5, end_s + 2.0) < 0.02  # what follows is as good as before
+
+
 def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, long_measurements: list[Measurement]) -> None:
     """Lost is reported, no pose meanwhile, and the next epoch begins at the prediction with its covariance."""
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")

@@ -213,6 +213,12 @@ def with_wide_attitude(initial: InitialState) -> InitialState:
     return with_free_gravity(replace(initial, uncertainty=uncertainty, is_known=False))
 
 
+def with_uncertain_position(initial: InitialState, sigma_m: float) -> InitialState:
+    """Return an initial state whose position is less certain, by a standard deviation of each coordinate."""
+    pose = initial.uncertainty.pose + np.diag([0.0] * 3 + [sigma_m] * 3) ** 2
+    return replace(initial, uncertainty=replace(initial.uncertainty, pose=pose))
+
+
 def _at_kept_pose(
     stamp_ns: int, state: RigState, pose_covariance: Float, gravity_covariance: Float | None
 ) -> InitialState:

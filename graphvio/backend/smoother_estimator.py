@@ -22,6 +22,7 @@ from graphvio.backend.initial_state import (
     with_free_gravity,
     with_late_imu,
     with_new_imu,
+    with_uncertain_position,
     with_wide_attitude,
 )
 from graphvio.backend.smoother import Smoother
@@ -38,6 +39,8 @@ from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
 _MIN_AGAINST_STANDSTILL = 3  # rejected motions, soon after an initialisation at a standstill
+_MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
+_MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
@@ -298,6 +301,8 @@ class SmootherEstimator:
         self._add_refused(motion)
         if self._may_be_moving and len(self._refused) >= _MIN_AGAINST_STANDSTILL:
             self._is_distrusted, why = True, "it was initialised in a steady motion, as at a standstill"
+        elif self._gap_s > _MIN_GAP_S and len(self._refused) >= _MIN_AFTER_GAP:
+            self._is_distrusted, why = True, f"refused after {self._gap_s:.1f} s that the IMU alone has bridged"
         elif self._is_distrusted:
             why = "the IMU was corrected wrongly while vision was refused"
         elif motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
@@ -376,6 +381,10 @@ class SmootherEstimator:
         )
         if self._is_distrusted:
             initial = with_wide_attitude(initial)
+        if self._gap_s > _MIN_GAP_S:
+            # The velocity was wrong by more and more: the way through the gap is off by its mean.
+            off_m_s = float(np.linalg.norm(initial.state.velocity_nav - predicted.velocity_nav))
+            initial = with_uncertain_position(initial, 0.5 * off_m_s * self._gap_s)
         self._reinitialise(initial, self._tracked_ns)
         apart_m = np.linalg.norm(se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)[3:])
         self._report(
@@ -422,6 +431,11 @@ class SmootherEstimator:
         self._refused.clear()
         self._imu_failed = self._is_distrusted = False
         self._status.is_lost = False
+
+    @property
+    def _gap_s(self) -> float:
+        """Time over which the IMU alone had measured the motion when vision was first refused, seconds."""
+        return 1e-9 * (min(self._refused) - self._tracked_ns) if self.has_imu and self._refused else 0.0
 
     @property
     def _may_be_moving(self) -> bool:
