@@ -31,9 +31,11 @@ def body_motion(camera_shift: list[float]) -> Float:
     return np.asarray(BODY_T_CAM @ cur_T_ref @ se3_inverse(BODY_T_CAM))
 
 
-def measured(cur_T_ref: Float, cameras: list[int], predicted: Float | None) -> RelativeMotion:
+def measured(
+    cur_T_ref: Float, cameras: list[int], predicted: Float | None, duration_ns: int = 100_000_000
+) -> RelativeMotion:
     refined = Refined(cur_T_ref, COVARIANCE, np.zeros((6, 6)), np.ones(N, dtype=bool), np.zeros(N))
-    motion = RelativeMotion(0, 100_000_000, se3_inverse(cur_T_ref), COVARIANCE, np.zeros((6, 6)), N)
+    motion = RelativeMotion(0, duration_ns, se3_inverse(cur_T_ref), COVARIANCE, np.zeros((6, 6)), N)
     return with_free_length(ARRAYS, of_cameras(cameras), refined, motion, predicted)
 
 
@@ -55,7 +57,15 @@ def test_length_that_is_possible_stays_and_is_free() -> None:
     shift, sigmas = of_camera(measured(body_motion([0.05, 0.0, 0.0]), [1] * N, body_motion([0.06, 0.0, 0.0])))
     np.testing.assert_allclose(shift, [0.05, 0.0, 0.0], atol=1e-12)
     assert sigmas[0] == pytest.approx(np.hypot(0.05, 0.01), rel=1e-3)
-    assert sigmas[1] == pytest.approx(0.01, rel=1e-3)
+    assert sigmas[1] == pytest.approx(np.hypot(0.01, 0.1 * 0.01), rel=1e-3)
+
+
+def test_direction_is_as_uncertain_as_a_tenth_of_the_error_of_the_length() -> None:
+    """After a standstill of seconds, by depths that are four times as large."""
+    far, near = body_motion([0.2, 0.0, 0.0]), body_motion([0.05, 0.0, 0.0])
+    shift, sigmas = of_camera(measured(far, [1] * N, near, 4_000_000_000))
+    np.testing.assert_allclose(shift, [0.2, 0.0, 0.0], atol=1e-12)
+    assert sigmas[1] == pytest.approx(np.hypot(0.01, 0.1 * 0.15), rel=1e-3)
 
 
 def test_length_that_is_impossible_becomes_that_of_the_prediction() -> None:

@@ -29,6 +29,7 @@ from graphvio.measurements.motion import RelativeMotion
 
 _SIGMA = 0.01  # of a common scale, relative: wide next to what a good pair knows of a step, narrow next to the IMU
 _WEAKEST_SIGMA = 10.0  # rad and m, of directions that no point constrains
+_DIRECTION_SHARE = 0.1  # of the error of a length, by which the direction is off: not all depths have one factor
 
 
 def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Refined, config: MotionConfig) -> Refined:
@@ -110,6 +111,8 @@ def _with_possible_length(
 ) -> RelativeMotion:
     """Return a motion of single cameras with a length that the rig can have: while no depth is known, any fits.
 
+    Soon after a standstill, depths are anything: the motion may be several times too long, and bends with them.
+
     Args:
         rig: P pairs and single cameras.
         single: The camera, or one of several.
@@ -122,6 +125,8 @@ def _with_possible_length(
     measured = cam_T_body @ se3_inverse(motion.reference_T_current) @ body_T_cam
     translation, expected = measured[:3, 3].copy(), (cam_T_body @ predicted @ body_T_cam)[:3, 3]
     length, longest = np.linalg.norm(translation), np.linalg.norm(expected) + slack_m
+    bent = np.diag([0.0] * 3 + [_DIRECTION_SHARE * (min(length, longest) - np.linalg.norm(expected))] * 3) ** 2
+    motion = replace(motion, covariance=motion.covariance + bent, shared_covariance=motion.shared_covariance + bent)
     if length <= longest:
         return motion
     measured[:3, 3] = translation * max(float(expected @ translation), 0.0) / length**2
