@@ -20,9 +20,7 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Rig, StereoPair
 
 _CHECKED_AFTER = (10, 100)  # framesets in which few of a pair's corners have a depth
-_CHECKED_AGAIN = (
-    10  # of so many framesets in which more have one, one is checked: a wrong calibration matches some, too
-)
+_CHECKED_AGAIN = 10  # framesets with more, of which one is checked: a wrong calibration matches some corners, too
 _FEW_POINTS = 0.3  # of the corners; some always match something
 _MIN_CORNERS = 30
 _MIN_MATCHES = 30
