@@ -9,7 +9,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import build_pyramid, register, track
-from graphvio.frontend.patches import lattice, prepare, room
+from graphvio.frontend.patches import bordered_room, lattice, prepare, room
 from graphvio.frontend.sampling import pixel_words
 
 LEVELS = 4
@@ -273,10 +273,10 @@ def test_sample_up_to_the_edge_stays_within_the_image() -> None:
 def test_prepare_computes_gradients_of_any_size(half: int) -> None:
     """Central differences of the patch with its border, all of zero mean, and zero in the padding."""
     side = 2 * half + 1
-    bordered, patch, gx, gy = room(half + 1), room(half), room(half), room(half)
+    bordered, patch, gx, gy = bordered_room(half), room(half), room(half), room(half)
     values = np.random.default_rng(half).random((side + 2, side + 2)).astype(np.float32)
-    bordered.rows[:, : side + 2] = values
-    bordered.rows[:, side + 2 :] = 1e30  # what `sample` leaves in its padding has no weight
+    bordered.flat[:] = 1e30  # what lies behind the last row has no weight
+    bordered.rows[:] = values
     normal = prepare(bordered, lattice(half).inside, patch, gx, gy)
     plain_values = [
         values[1:-1, 1:-1],

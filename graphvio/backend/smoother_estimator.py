@@ -68,6 +68,7 @@ class SmootherEstimator:
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._accepted = 0  # motions since the initialisation
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
+        self._is_chain_after_gap = False  # whether these begin at a state that the IMU alone has led to
         self._imu_failed = False  # samples were missing after the first rejected motion
         self._is_distrusted = False  # calibration of the IMU or initial state proved to be wrong
         self._is_imu_left_out = False
@@ -301,7 +302,7 @@ class SmootherEstimator:
         self._add_refused(motion)
         if self._may_be_moving and len(self._refused) >= _MIN_AGAINST_STANDSTILL:
             self._is_distrusted, why = True, "it was initialised in a steady motion, as at a standstill"
-        elif self._gap_s > _MIN_GAP_S and len(self._refused) >= _MIN_AFTER_GAP:
+        elif self._gap_s > _MIN_GAP_S and not self._may_be_moving and len(self._refused) >= _MIN_AFTER_GAP:
             self._is_distrusted, why = True, f"refused after {self._gap_s:.1f} s that the IMU alone has bridged"
         elif self._is_distrusted:
             why = "the IMU was corrected wrongly while vision was refused"
@@ -315,6 +316,8 @@ class SmootherEstimator:
     def _add_refused(self, motion: RelativeMotion) -> None:
         """Record the pose that a refused motion leads to, from a state or from the pose that earlier ones led to."""
         reference_ns = motion.reference_stamp_ns
+        if not self._refused:
+            self._is_chain_after_gap = reference_ns > self._tracked_ns
         nav_T_reference = self._refused.get(reference_ns)
         if nav_T_reference is None:
             nav_T_reference = self._running.pose(reference_ns)
@@ -370,8 +373,9 @@ class SmootherEstimator:
     def _reinitialise_from_vision(self, motion: RelativeMotion, why: str) -> None:
         """Reinitialise at the pose by refused motions that go on agreeing with each other: the prediction is at fault.
 
-        Their chain begins at a state that was accepted. Unless the IMU is known to have failed at that moment, or was
-        corrected wrongly, the pose is uncertain by as much as it differs from the prediction.
+        Their chain begins at a state that was accepted, or after a gap that the IMU alone has bridged. Unless the IMU
+        is known to have failed at that moment, or was corrected wrongly, the pose is uncertain by as much as it differs
+        from the prediction.
         """
         smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
         predicted = smoother.state()
@@ -381,7 +385,7 @@ class SmootherEstimator:
         )
         if self._is_distrusted:
             initial = with_wide_attitude(initial)
-        if self._gap_s > _MIN_GAP_S:
+        if self._gap_s > _MIN_GAP_S and self._is_chain_after_gap:
             # The velocity was wrong by more and more: the way through the gap is off by its mean.
             off_m_s = float(np.linalg.norm(initial.state.velocity_nav - predicted.velocity_nav))
             initial = with_uncertain_position(initial, 0.5 * off_m_s * self._gap_s)
@@ -435,7 +439,9 @@ class SmootherEstimator:
     @property
     def _gap_s(self) -> float:
         """Time over which the IMU alone had measured the motion when vision was first refused, seconds."""
-        return 1e-9 * (min(self._refused) - self._tracked_ns) if self.has_imu and self._refused else 0.0
+        if not self.has_imu or self._is_imu_left_out or not self._refused:
+            return 0.0
+        return 1e-9 * (min(self._refused) - self._tracked_ns)
 
     @property
     def _may_be_moving(self) -> bool:

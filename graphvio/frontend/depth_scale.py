@@ -124,20 +124,21 @@ def _with_possible_length(
     cam_T_body = se3_inverse(body_T_cam)
     measured = cam_T_body @ se3_inverse(motion.reference_T_current) @ body_T_cam
     translation, expected = measured[:3, 3].copy(), (cam_T_body @ predicted @ body_T_cam)[:3, 3]
-    length, longest = np.linalg.norm(translation), np.linalg.norm(expected) + slack_m
-    bent = np.diag([0.0] * 3 + [_DIRECTION_SHARE * (min(length, longest) - np.linalg.norm(expected))] * 3) ** 2
-    motion = replace(motion, covariance=motion.covariance + bent, shared_covariance=motion.shared_covariance + bent)
-    if length <= longest:
-        return motion
-    measured[:3, 3] = translation * max(float(expected @ translation), 0.0) / length**2
-    share = np.diag(np.repeat([1.0, longest / length], 3))  # the direction is as uncertain as before
-    scaled = se3_adjoint(body_T_cam) @ share @ se3_adjoint(cam_T_body)
-    return replace(
-        motion,
-        reference_T_current=se3_inverse(body_T_cam @ measured @ cam_T_body),
-        covariance=scaled @ motion.covariance @ scaled.T,
-        shared_covariance=scaled @ motion.shared_covariance @ scaled.T,
-    )
+    length, expected_length = float(np.linalg.norm(translation)), float(np.linalg.norm(expected))
+    longest = expected_length + slack_m
+    if length > longest:
+        measured[:3, 3] = translation * max(float(expected @ translation), 0.0) / length**2
+        share = np.diag(np.repeat([1.0, longest / length], 3))  # the direction is as uncertain as before
+        scaled = se3_adjoint(body_T_cam) @ share @ se3_adjoint(cam_T_body)
+        motion = replace(
+            motion,
+            reference_T_current=se3_inverse(body_T_cam @ measured @ cam_T_body),
+            covariance=scaled @ motion.covariance @ scaled.T,
+            shared_covariance=scaled @ motion.shared_covariance @ scaled.T,
+        )
+    bent_m = _DIRECTION_SHARE * (min(length, longest) - expected_length)
+    bent = np.diag([0.0] * 3 + [bent_m] * 3) ** 2
+    return replace(motion, covariance=motion.covariance + bent, shared_covariance=motion.shared_covariance + bent)
 
 
 def with_scale_of_depths(rig: RigArrays, single: int, motion: Refined) -> Refined:

@@ -115,8 +115,14 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
         gy: output, along the columns.
     """
     side, stride = patch.rows.shape
+    pitch = side + 2
     for j in range(side):
-        above, at, below, weights = bordered.rows[j], bordered.rows[j + 1], bordered.rows[j + 2], inside.rows[j]
+        above, at, below = (
+            bordered.flat[j * pitch :],
+            bordered.flat[(j + 1) * pitch :],
+            bordered.flat[(j + 2) * pitch :],
+        )
+        weights = inside.rows[j]
         values, dx, dy = patch.rows[j], gx.rows[j], gy.rows[j]
         for i in range(stride):  # whole registers: behind a row comes the next one, which has no weight
             values[i] = weights[i] * at[i + 1]

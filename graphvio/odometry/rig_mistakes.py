@@ -52,7 +52,7 @@ class RigMistakes:
         return list(self._warnings.values())
 
     def update(self, frameset: FrameSet, visual: VisualResult) -> None:
-        """Check a pair that finds few of its corners in its right image, twice; nothing is done for any other pair."""
+        """Check a pair that finds few of its corners in its right image, twice, and one that is mistaken again."""
         for j in self._pairs.keys() & frameset.images.keys() & visual.pairs.keys():
             seen = visual.pairs[j]
             if len(seen.pixels) < _MIN_CORNERS:
@@ -63,8 +63,9 @@ class RigMistakes:
             self._with_few_points[j] += 1
             if self._with_few_points[j] not in _CHECKED_AFTER or j in self._warnings:
                 continue
-            mistakes = self._mistakes(j, frameset)
+            mistakes, _ = self._mistakes(j, frameset)
             if mistakes:
+                self._with_more_points[j] = 0
                 self._warnings[j] = f"{self._pairs[j].name}: its images match only if {' or '.join(mistakes)}"
                 self._report(frameset.stamp_ns, EventKind.RIG_MISTAKEN, self._warnings[j])
 
@@ -72,12 +73,18 @@ class RigMistakes:
         """Withdraw the warning of a pair whose images match as the rig is: somebody has plugged the cables right."""
         if j not in self._warnings:
             return
-        if self._with_more_points[j] % _CHECKED_AGAIN == 0 and not self._mistakes(j, frameset):
-            del self._warnings[j]
+        if self._with_more_points[j] % _CHECKED_AGAIN == 0:
+            mistakes, matches = self._mistakes(j, frameset)
+            if not mistakes and matches >= _MIN_MATCHES:
+                del self._warnings[j]
+                self._with_few_points[j] = 0
         self._with_more_points[j] += 1
 
-    def _mistakes(self, j: int, frameset: FrameSet) -> list[str]:
-        """Return the mistakes without which the images match. They may be the same, where body has a camera's axes."""
+    def _mistakes(self, j: int, frameset: FrameSet) -> tuple[list[str], int]:
+        """Return the mistakes without which the images match, and how many corners match as the rig is.
+
+        Mistakes may be the same, where body has a camera's axes.
+        """
         pair = self._pairs[j]
         left, right = (np.ascontiguousarray(image) for image in frameset.images[j])
         n_as_it_is = self._matches(pair, left, right)
@@ -85,7 +92,8 @@ class RigMistakes:
         inverted = _inverted(pair)
         if inverted is not None:
             n_undone[_INVERTED] = self._matches(inverted, left, right)
-        return [mistake for mistake, n in n_undone.items() if n >= _MIN_MATCHES and n_as_it_is < _MAX_SHARE * n]
+        mistakes = [mistake for mistake, n in n_undone.items() if n >= _MIN_MATCHES and n_as_it_is < _MAX_SHARE * n]
+        return mistakes, n_as_it_is
 
     def _matches(self, pair: StereoPair, left: Image, right: Image) -> int:
         """Count the corners of a left image that have a depth by the right one."""

@@ -312,6 +312,7 @@ class SelfCalibration:
         self._evidence, self._prior = self._evidence.after_random_walk(change), self._prior.changed(change)
         self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self._used_windows, self._agreeing, self._refused = 0, 0, 0
+        self._knocks = KnockDetector()  # offsets by another calibration are not comparable
         self.restarts += 1
         self._consider.forget()
 
