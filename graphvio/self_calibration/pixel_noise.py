@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Float
 from graphvio.self_calibration.bundle import Tracks
 
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
@@ -21,8 +21,7 @@ def pixel_noise(errors2: Float, sigma_px: float | Float) -> float:
         errors2: squared errors of the views, whitened by the noise that was assumed; NaN where there is no view.
         sigma_px: noise that was assumed, of all or of each.
     """
-    noise = float(np.sqrt(np.nanmedian(errors2 * np.square(sigma_px)))) / _RAYLEIGH_MEDIAN
-    return max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
+    return max(_shown_noise(errors2, sigma_px), _MIN_SIGMA_PX)
 
 
 def noise_of_views(tracks: Tracks, errors2: Float) -> Float:
@@ -35,23 +34,17 @@ def noise_of_views(tracks: Tracks, errors2: Float) -> Float:
         tracks: with the noise that was assumed.
         errors2: (N, 2) squared errors, whitened by it; NaN where there is no right image.
     """
-    view = np.repeat(tracks.pair, np.diff(tracks.rows)) * (1 + tracks.keyframe.max(initial=0)) + tracks.keyframe
-    squares = errors2 * np.square(tracks.sigma_px)[:, None]
-    shown_px = _NOISE_FACTOR * np.sqrt(_medians(squares.ravel(), np.repeat(view, 2))) / _RAYLEIGH_MEDIAN
-    is_judged = np.bincount(view)[view] >= _MIN_OBSERVATIONS
-    is_noisier = is_judged & (shown_px[view] > _MIN_EXCESS * tracks.sigma_px)
-    return np.where(is_noisier, shown_px[view], tracks.sigma_px)
+    noise_px, pair = tracks.sigma_px.copy(), np.repeat(tracks.pair, np.diff(tracks.rows))
+    for j in np.unique(pair):
+        for k in np.unique(tracks.keyframe[pair == j]):
+            of_view = (pair == j) & (tracks.keyframe == k)
+            if np.count_nonzero(of_view) >= _MIN_OBSERVATIONS:
+                assumed_px = tracks.sigma_px[of_view]
+                shown_px = _shown_noise(errors2[of_view], assumed_px[:, None])
+                noise_px[of_view] = np.where(shown_px > _MIN_EXCESS * assumed_px, shown_px, assumed_px)
+    return noise_px
 
 
-def _medians(values: Float, group: Int) -> Float:
-    """Return the medians (G,) of values (N,) in groups of 0 to G - 1; NaN is left out, and the result of nothing."""
-    n_groups, known = group.max(initial=-1) + 1, ~np.isnan(values)
-    values, group = values[known], group[known]
-    order = np.lexsort((values, group))
-    counts = np.bincount(group, minlength=n_groups)
-    firsts = np.cumsum(counts) - counts
-    medians = np.full(len(counts), np.nan)
-    filled = counts > 0
-    lower, upper = (firsts + (counts - 1) // 2)[filled], (firsts + counts // 2)[filled]
-    medians[filled] = 0.5 * (values[order[lower]] + values[order[upper]])
-    return medians
+def _shown_noise(errors2: Float, sigma_px: float | Float) -> float:
+    """Return the noise that whitened errors show, px; at least one of them must be known."""
+    return _NOISE_FACTOR * float(np.sqrt(np.nanmedian(errors2 * np.square(sigma_px)))) / _RAYLEIGH_MEDIAN
