@@ -85,9 +85,10 @@ class EventKind(StrEnum):
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
     """The gate rejected vision for too long; the smoother is reinitialised from vision, the filter's velocities are
-    reset. Or the IMU's calibration turns out to be wrong while vision is rejected: the smoother is reinitialised from
-    vision. Or the frameset that motions are measured from was rejected, and the next motion passes: the smoother goes
-    on from the prediction, uncertain by what vision said."""
+    reset. Or the IMU's calibration turns out to be wrong while vision is rejected, or good images are rejected after a
+    gap that the IMU alone has bridged: the smoother is reinitialised from vision. Or the frameset that motions are
+    measured from was rejected, and the next motion passes: the smoother goes on from the prediction, uncertain by what
+    vision said."""
     SCALE_KNOWN = "scale_known"
     """A rig of single cameras has moved so that the scale is known; poses are estimated from now on."""
     LOST = "lost"
