@@ -63,6 +63,6 @@ def adjusted(
     if samples is not None and len(outliers):
         samples = samples.without(outliers)
     if len(outliers) or not np.array_equal(noise_px, tracks.sigma_px):
-        window = Window(tracks._replace(sigma_px=noise_px), samples)
-        solution = solve(window, states, nominal, difference, prior)
+        window = Window(solution.window.tracks._replace(sigma_px=noise_px), samples)
+        solution = solve(window, solution.states, nominal, solution.calibration.mean, prior)
     return solution

@@ -282,7 +282,7 @@ class SelfCalibration:
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
         ):
-            self._sigma_px = pixel_noise(solution.errors2, solution.sigma_px[:, None])
+            self._sigma_px = pixel_noise(solution.errors2, solution.window.tracks.sigma_px[:, None])
         self._consider.extend(adjusted.keyframes, adjusted.by_cameras)
         difference = adjusted.estimate.difference[:n]
         self._consider.set_calibration_in_force(difference, adjusted.covariance, self._since_newest())

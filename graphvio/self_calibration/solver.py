@@ -64,8 +64,8 @@ class Solution(NamedTuple):
     Attributes:
         states: adjusted.
         calibration: posterior of the difference from the nominal calibration.
+        window: what was adjusted, with the frames of the adjusted landmarks.
         errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
-        sigma_px: (N,) noise of a corner's position by which they are whitened.
         imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
         hessian: of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
         has_converged: whether the last step, with next to no damping, hardly changed the calibration; else it is no
@@ -74,8 +74,8 @@ class Solution(NamedTuple):
 
     states: States
     calibration: Gaussian
+    window: Window
     errors2: Float
-    sigma_px: Float
     imu_errors2: Float
     hessian: Float
     has_converged: bool
@@ -142,8 +142,7 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         found = Eliminated.empty(window.tracks)
         at = _linearise(window, states, first, nominal, difference, prior, _MIN_DAMPING, found)
     posterior = Gaussian(difference, _marginal(at.hessian, calibration))
-    noise_px = window.tracks.sigma_px
-    return Solution(states, posterior, at.errors2, noise_px, at.imu_errors2, at.hessian, has_converged)
+    return Solution(states, posterior, window, at.errors2, at.imu_errors2, at.hessian, has_converged)
 
 
 def _linearise(

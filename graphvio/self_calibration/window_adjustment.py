@@ -28,6 +28,8 @@ from graphvio.self_calibration.prior import extrinsic_covariances
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe
 
+_MAX_CHANGE = 2.0  # of the file's factors, with which a window is not adjusted again
+
 
 class AdjustedWindow(NamedTuple):
     """A window's result.
@@ -89,8 +91,9 @@ class WindowAdjustment:
         """Adjust the window; None where the measurements determine nothing, or an IMU that is impossible."""
         try:
             fitted = self._fitted(self.factors, self.difference)
-            if fitted.solution.has_converged and not np.array_equal(inexact(fitted.factors), inexact(self.factors)):
-                # What the window says was linearised where another file led it.
+            change = inexact(fitted.factors) / inexact(self.factors)
+            if fitted.solution.has_converged and (np.maximum(change, 1.0 / change) > _MAX_CHANGE).any():
+                # What the window says was linearised where quite another file led it.
                 fitted = self._fitted(fitted.factors, fitted.solution.calibration.mean)
             return self._judged(fitted) if fitted.solution.has_converged else None
         except (np.linalg.LinAlgError, RigError):
