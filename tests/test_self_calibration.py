@@ -46,6 +46,7 @@ from graphvio.self_calibration.parameters import (
     PAIR,
     RigCalibration,
     has_coefficient,
+    n_camera_parameters,
     parameter_names,
 )
 from graphvio.self_calibration.prior import file_prior, refined_sigmas
@@ -626,27 +627,47 @@ def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_le
     assert np.abs(other.left.body_T_cam - in_file.left.body_T_cam).max() < 1e-5
 
 
+def known_cameras(rig: Rig) -> Float:
+    """Return the covariance of cameras that are known ten times better than by a file."""
+    n = n_camera_parameters(rig)
+    return 0.01 * file_prior(rig).covariance[:n, :n]
+
+
 def test_knock_detector_names_the_pair_that_is_off() -> None:
     rig = default_rig().without_imu()
     pair = rig.pairs[1]
     turned = pair.right.body_T_cam @ se3_exp(np.deg2rad([0.06, 0.06, 0.06, 0.0, 0.0, 0.0]))
     knocked = replace(rig, pairs=(rig.pairs[0], replace(pair, right=replace(pair.right, body_T_cam=turned))))
-    in_force, every_view = RigCalibration.of(rig), [views for _, _, views in Walk(knocked).framesets(0.5)]
+    in_force, known = RigCalibration.of(rig), known_cameras(rig)
+    every_view = [views for _, _, views in Walk(knocked).framesets(0.5)]
     detector = KnockDetector()
-    assert [detector.update(views, in_force) for views in every_view[:3]] == [[], [], [1]]
+    assert [detector.update(views, in_force, known) for views in every_view[:3]] == [[], [], [1]]
     detector = KnockDetector()  # pairs that are triggered in turns
     in_turns = [{k % 2: views[k % 2]} for k, views in enumerate(every_view)]
-    assert [detector.update(views, in_force) for views in in_turns[:6]] == [[], [], [], [], [], [1]]
+    assert [detector.update(views, in_force, known) for views in in_turns[:6]] == [[], [], [], [], [], [1]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_knock_detector_takes_no_calibration_that_is_not_known_yet_for_a_knock(seed: int) -> None:
+    error = draw(default_rig().without_imu(), CalibrationErrorSizes.of_level(2, CAMERAS), seed)
+    in_force, by_file = RigCalibration.of(error.written_rig), 100.0 * known_cameras(error.written_rig)
+    every_view = [views for _, _, views in Walk(error.true_rig, seed=seed).framesets(0.5)]
+    found = {}
+    for share in (1.0, 1e-4):
+        detector = KnockDetector()
+        found[share] = sum(len(detector.update(views, in_force, share * by_file)) for views in every_view)
+    assert found[1.0] == 0
+    assert found[1e-4] > 0
 
 
 @pytest.mark.parametrize(("scene", "most"), [("room", 0), ("calibration", 1)])
 def test_knock_detector_takes_no_late_camera_for_a_turned_one(scene: str, most: int) -> None:
     rig = default_rig().without_imu()
-    detector, in_force = KnockDetector(), RigCalibration.of(rig)
+    detector, in_force, known = KnockDetector(), RigCalibration.of(rig), known_cameras(rig)
     off_px, knocks = [], 0
     for _, _, views in list(LateRight(rig, scene=scene).framesets(20.0))[::3]:
         off_px.append(abs(epipolar_offset_px(views[0], in_force, 0) or 0.0))
-        knocks += len(detector.update(views, in_force))
+        knocks += len(detector.update(views, in_force, known))
     assert np.mean(np.array(off_px) > 0.25) > 0.8
     assert knocks <= most  # some 30 and 40 where three keyframes off their lines are enough
 

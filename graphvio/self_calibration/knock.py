@@ -10,11 +10,12 @@ from graphvio.arrays import Float
 from graphvio.cameras import central_scale, unproject_pixels
 from graphvio.geometry import skew
 from graphvio.rig import Rig
-from graphvio.self_calibration.parameters import STEREO, RigCalibration, extrinsics_of, slices_of_groups
+from graphvio.self_calibration.parameters import PAIR, STEREO, RigCalibration, extrinsics_of, slices_of_groups
 from graphvio.self_calibration.window import View
 
 _MIN_MATCHES = 30
-_MAX_OFFSET_PX = 0.25  # median; a calibration in force is off by a tenth of it
+_MAX_OFFSET_PX = 0.25  # median; a calibration that is well known is off by a tenth of it
+_MAX_SIGMAS = 4.0  # of the offset by what is known of the calibration: elsewhere in an image it may be known less well
 _CONFIRMED = 3  # keyframes, one after the other
 _MAX_CHANGE = 0.2  # relative, between these keyframes: a turned camera's offset stays, a late camera's does not
 _TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # what a knock may do to a camera and to a pair
@@ -26,8 +27,13 @@ class KnockDetector:
     def __init__(self) -> None:
         self._off_px: dict[int, list[float]] = {}  # pair index -> offsets at its newest keyframes, one after the other
 
-    def update(self, views: Mapping[int, View], calibration: RigCalibration) -> list[int]:
+    def update(self, views: Mapping[int, View], calibration: RigCalibration, covariance: Float) -> list[int]:
         """Add a keyframe's views.
+
+        Args:
+            views: index of the pair or single camera -> tracks.
+            calibration: that is in force.
+            covariance: (C, C) of the cameras' parameters, by which these are known.
 
         Returns:
             Indices of the pairs whose offset has lasted for three of their keyframes: they are not where they were.
@@ -37,7 +43,9 @@ class KnockDetector:
             if offset_px is None:
                 continue
             known_px = self._off_px.pop(j, [])
-            if abs(offset_px) > _MAX_OFFSET_PX:
+            if abs(offset_px) > _MAX_OFFSET_PX and abs(offset_px) > _MAX_SIGMAS * _offset_sigma_px(
+                view, calibration, j, covariance
+            ):
                 lasts = all(abs(offset_px - known) <= _MAX_CHANGE * abs(offset_px) for known in known_px)
                 self._off_px[j] = [*known_px, offset_px] if lasts else [offset_px]
         knocked = [j for j, offsets in self._off_px.items() if len(offsets) >= _CONFIRMED]
@@ -63,6 +71,19 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
     distances = np.sum(lines * rays[1], axis=1) / np.hypot(lines[:, 0], lines[:, 1])
     scale = central_scale(int(calibration.models[pair, 1]), calibration.distortion[pair, 1])
     return float(np.median(distances) * calibration.intrinsics[pair, 1, 0] * scale)
+
+
+def _offset_sigma_px(view: View, calibration: RigCalibration, pair: int, covariance: Float) -> float:
+    """Return the standard deviation of `epipolar_offset_px` by what is known of the calibration."""
+    own = np.flatnonzero(calibration.columns // PAIR == pair)
+    of_own = covariance[np.ix_(own, own)]
+    gradient = np.zeros(len(own))
+    for k, sigma in enumerate(np.sqrt(np.diag(of_own))):
+        step = np.zeros(len(covariance))
+        for sign in (1.0, -1.0):
+            step[own[k]] = sign * sigma
+            gradient[k] += sign * (epipolar_offset_px(view, calibration.moved(step), pair) or 0.0) / (2.0 * sigma)
+    return float(np.sqrt(gradient @ of_own @ gradient))
 
 
 def knock_covariance(rig: Rig, n_parameters: int, groups: Iterable[int]) -> Float:

@@ -152,7 +152,7 @@ class SelfCalibration:
         if not self._collector.is_keyframe(stamp_ns, views, self._pace.interval_s):
             return
         if self.is_trusted:
-            if knocked := self._knocks.update(views, self._in_force):
+            if knocked := self._knocked(views):
                 self._forget_extrinsics(knocked)
             elif are_contradicting:
                 return
@@ -298,6 +298,13 @@ class SelfCalibration:
         """Return how the newest pose depends on the calibration since the keyframe that was adjusted last."""
         newest_ns = self._consider.newest_ns
         return None if newest_ns is None else self._gains.since(newest_ns)
+
+    def _knocked(self, views: Mapping[int, View]) -> list[int]:
+        """Return the pairs that have been knocked, by what a keyframe adds; none while too little is known of them."""
+        if not (self.is_confirmed or self.estimate.is_file_exact):
+            return []
+        n = self._n_camera_parameters
+        return self._knocks.update(views, self._in_force, self.estimate.posterior.covariance[:n, :n])
 
     def _refuse(self, is_full: bool) -> None:
         """Discard a window that contradicts those before it; several such windows are a knock."""
