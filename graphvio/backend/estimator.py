@@ -15,6 +15,7 @@ from graphvio.backend.states import RigState, StateCovariance
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.inertial_state import InertialState
 from graphvio.measurements.motion import LocatedPoints, RelativeMotion, VisualResult
 
 
@@ -191,6 +192,18 @@ class ImuFaultTolerant(Protocol):
         Args:
             motion: By vision, that ends in the newest state.
             imu: The IMU around the state and the state's place in that interval, seconds.
+        """
+
+    def use_inertial_state(self, known: InertialState) -> bool:
+        """Go on with velocity, biases and gravity from a keyframe, if they are known about as well as the state's.
+
+        Not while motions are being refused, or the IMU is left out.
+
+        Args:
+            known: At a keyframe, by its frameset's stamp.
+
+        Returns:
+            Whether the state was reinitialised, so that later motions have to be measured from the newest frameset.
         """
 
     def distrust_prediction(self) -> None:

@@ -17,6 +17,7 @@ from graphvio.rig import Imu
 _ACCEL_BIAS_SIGMA = 0.2
 _GRAVITY_SIGMA_M_S2 = 0.02  # of its length, on Earth
 _MIN_GRAVITY_SIGMA_M_S2 = 1e-3
+_MIN_INERTIAL_SIGMA = 1e-4  # of m/s, m/s^2, rad/s
 _X, _V, _B, _R, _G, _SUM = (int(gtsam.symbol(letter, 0)) for letter in "xvbrgs")  # a call for each key takes longer
 _ZERO_VELOCITY_SIGMA_M_S = 0.005  # of the velocity while the images do not move
 
@@ -49,26 +50,41 @@ def g() -> int:
 def first_state(
     k: int, state: RigState, uncertainty: InitialUncertainty, with_imu: bool
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the priors of the first state."""
+    """Yield the priors of the first state, and with an IMU those of gravity."""
     yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(state.nav_T_body), gaussian(uncertainty.pose))
-    if with_imu:
+    if not with_imu:
+        return
+    if uncertainty.inertial is not None:
+        yield _inertial_prior(k, state, uncertainty.inertial)
+    else:
         yield gtsam.PriorFactorVector(v(k), state.velocity_nav, isotropic(3, uncertainty.velocity_m_s))
         sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
         yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-
-
-def gravity(gravity_nav: Float, covariance: Float) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the priors of gravity in nav: of its direction, and of its length.
-
-    Args:
-        gravity_nav: (3,) m/s^2.
-        covariance: (3, 3) of its direction.
-    """
-    along = np.outer(gravity_nav, gravity_nav)  # says next to nothing of the length
-    floor = _MIN_GRAVITY_SIGMA_M_S2**2 * np.eye(3)
-    yield gtsam.PriorFactorVector(g(), gravity_nav, gaussian(covariance + along + floor))
+        along = np.outer(state.gravity_nav, state.gravity_nav)  # says next to nothing of the length
+        floor = _MIN_GRAVITY_SIGMA_M_S2**2 * np.eye(3)
+        yield gtsam.PriorFactorVector(g(), state.gravity_nav, gaussian(uncertainty.gravity + along + floor))
     yield gtsam.CustomFactor(isotropic(1, _GRAVITY_SIGMA_M_S2), [g()], _length_error)
+
+
+def _inertial_prior(k: int, state: RigState, covariance: Float) -> gtsam.NonlinearFactor:
+    """Return the joint prior of velocity, biases and gravity, by their covariance (12, 12)."""
+    whitener = np.linalg.inv(np.linalg.cholesky(covariance + _MIN_INERTIAL_SIGMA**2 * np.eye(12)))
+    linear = gtsam.JacobianFactor(
+        v(k),
+        whitener[:, :3],
+        b(k),
+        whitener[:, 3:9],
+        g(),
+        whitener[:, 9:],
+        np.zeros(12),
+        gtsam.noiseModel.Unit.Create(12),
+    )
+    values = gtsam.Values()
+    values.insert(v(k), state.velocity_nav)
+    values.insert(b(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
+    values.insert(g(), state.gravity_nav)
+    return gtsam.LinearContainerFactor(linear, values)
 
 
 def _length_error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:

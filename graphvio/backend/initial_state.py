@@ -21,6 +21,7 @@ from graphvio.backend.states import (
 from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.inertial_state import InertialState
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Rig
 
@@ -182,6 +183,42 @@ def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covar
     )
     initial = with_wide_attitude(_at_kept_pose(motion.stamp_ns, state, covariance.pose, covariance.gravity))
     return replace(initial, is_known=True)
+
+
+def with_inertial_state(
+    known: InertialState, then: RigState, now_ns: int, now: RigState, blind_s: float, covariance: StateCovariance
+) -> InitialState:
+    """Reinitialise at the present pose with velocity, biases and gravity that are known from a keyframe.
+
+    Args:
+        known: At the keyframe.
+        then: The state at the keyframe, as the estimator has it.
+        now_ns: Stamp of the newest state.
+        now: That state.
+        blind_s: Time for which vision has not constrained the state: the position goes on with the velocity.
+        covariance: Of the newest state.
+    """
+    since_s = 1e-9 * (now_ns - known.stamp_ns)
+    nav_R_then, nav_R_now = then.nav_T_body[:3, :3], now.nav_T_body[:3, :3]
+    gravity_nav = nav_R_then @ known.gravity
+    by_bias = -nav_R_now @ (known.accel_bias - now.accel_bias)
+    gained = now.velocity_nav - then.velocity_nav + since_s * (gravity_nav - now.gravity_nav + by_bias)
+    velocity_nav = nav_R_then @ known.velocity + gained
+    pose = now.nav_T_body.copy()
+    pose[:3, 3] += blind_s * (velocity_nav - now.velocity_nav)
+    state = RigState(pose, velocity_nav, known.gyro_bias, known.accel_bias, gravity_nav)
+    to_now = np.eye(12)
+    to_now[:3, :3] = to_now[9:, 9:] = nav_R_then
+    to_now[:3, 3:6], to_now[:3, 9:] = -since_s * nav_R_now, since_s * nav_R_then
+    inertial = to_now @ known.covariance @ to_now.T
+    uncertainty = InitialUncertainty(
+        certain_origin(),
+        float(np.sqrt(np.linalg.eigvalsh(inertial[:3, :3])[-1])),
+        0.0,
+        covariance.pose,
+        inertial=inertial,
+    )
+    return InitialState(now_ns, state, uncertainty)
 
 
 def with_late_imu(

@@ -20,7 +20,6 @@ from graphvio.backend.factors import (
     constant_velocity,
     first_state,
     g,
-    gravity,
     imu_without_samples,
     position_reset,
     v,
@@ -93,12 +92,10 @@ class Smoother:
         self._constrained_ns, self._seen_ns = stamp_ns, None
         to_nav = se3_adjoint(state.nav_T_body)
         self._nav_covariance = to_nav @ uncertainty.nav_covariance @ to_nav.T
-        for factor in first_state(k, state, uncertainty, self.has_imu):
-            self._window.add(factor)
         if self.has_imu:
             self._window.values.insert(g(), state.gravity_nav)
-            for factor in gravity(state.gravity_nav, uncertainty.gravity):
-                self._window.add(factor)
+        for factor in first_state(k, state, uncertainty, self.has_imu):
+            self._window.add(factor)
 
     def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
         """Predict the next state and append it: by the IMU, or without an interval of it by constant velocity."""
@@ -137,9 +134,9 @@ class Smoother:
         """Return ``nav_T_body`` (4, 4) of a state in the window, as it was last solved for."""
         return np.asarray(self._window.values.atPose3(x(self._index_of[stamp_ns])).matrix())
 
-    def state(self) -> RigState:
-        """Return the newest state."""
-        k = self._index_of[self.latest_ns]
+    def state(self, stamp_ns: int | None = None) -> RigState:
+        """Return the newest state, or that of a stamp in the window."""
+        k = self._index_of[self.latest_ns if stamp_ns is None else stamp_ns]
         values = self._window.values
         pose = np.asarray(values.atPose3(x(k)).matrix())
         if not self.has_imu:

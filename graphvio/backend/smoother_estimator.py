@@ -20,6 +20,7 @@ from graphvio.backend.initial_state import (
     from_prediction,
     from_vision,
     with_free_gravity,
+    with_inertial_state,
     with_late_imu,
     with_new_imu,
     with_uncertain_position,
@@ -34,6 +35,7 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.inertial_state import InertialState
 from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
@@ -41,6 +43,8 @@ _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions
 _MIN_AGAINST_STANDSTILL = 3  # rejected motions, soon after an initialisation at a standstill
 _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
+_MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
+_MIN_OFF2 = 12.0  # squared Mahalanobis distance of a state, of 12 dimensions, that is not kept
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
@@ -236,6 +240,30 @@ class SmootherEstimator:
             self.covariance = self._running.state_covariance()
         except SOLVER_ERRORS as error:
             self._rebuild(self.latest_ns, self.state(), error)
+
+    def use_inertial_state(self, known: InertialState) -> bool:
+        """Go on with velocity, biases and gravity from a keyframe, if they are known about as well as the state's."""
+        smoother, tilt = self._running, self.covariance.tilt
+        if not self.has_imu or self._is_imu_left_out or self._refused or not smoother.knows(known.stamp_ns):
+            return False
+        if tilt is None or known.tilt_sigma_rad > _MAX_TILT_RATIO * np.sqrt(np.linalg.eigvalsh(tilt)[-1]):
+            return False
+        try:
+            smoother.optimize()
+            then, now, covariance = smoother.state(known.stamp_ns), smoother.state(), smoother.state_covariance()
+            body_R_nav = then.nav_T_body[:3, :3].T
+            off2 = known.distance2(
+                body_R_nav @ then.velocity_nav, then.accel_bias, then.gyro_bias, body_R_nav @ then.gravity_nav
+            )
+            if off2 < _MIN_OFF2:  # both have seen the same: nothing is gained
+                return False
+            blind_s = 1e-9 * (smoother.latest_ns - self._tracked_ns)
+            initial = with_inertial_state(known, then, smoother.latest_ns, now, blind_s, covariance)
+            self._reinitialise(initial, self.latest_ns - 1)
+            self.covariance = self._running.state_covariance()
+        except SOLVER_ERRORS as error:
+            self._rebuild(self.latest_ns, self.state(), error)
+        return True
 
     def use_late_imu(self, motion: RelativeMotion, imu: tuple[ImuInterval, float]) -> None:
         """Use the IMU from now on, after an initialisation without: keep the newest pose, and take gravity from it.

@@ -51,6 +51,8 @@ class InitialUncertainty:
             uncertainty of where an epoch begins: no later measurement can reduce it.
         gravity: (3, 3) covariance of gravity's direction in nav, (m/s^2)^2; zero where nav is level by definition, so
             that measurements turn the poses.
+        inertial: (12, 12) joint covariance of velocity in nav, biases of accelerometer and gyro, and gravity in nav,
+            or None; it takes the place of their own ones.
     """
 
     pose: Float
@@ -58,6 +60,7 @@ class InitialUncertainty:
     gyro_bias_rad_s: float
     nav_covariance: Float = field(default_factory=lambda: np.zeros((6, 6)))
     gravity: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    inertial: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ class ImuCorrection:
         if self._is_none:
             return readings
         rate, force = readings[..., :3], readings[..., 3:]
-        return np.concatenate([self._rate(rate), self._force(force)], axis=-1)
+        return np.concatenate([self._rate(rate), self.applied_force(force)], axis=-1)
 
     def applied_to(self, interval: ImuInterval) -> ImuInterval:
         """Return an interval with corrected readings."""
@@ -43,7 +43,7 @@ class ImuCorrection:
         return replace(
             interval,
             angular_velocity=self._rate(interval.angular_velocity),
-            linear_acceleration=self._force(interval.linear_acceleration),
+            linear_acceleration=self.applied_force(interval.linear_acceleration),
         )
 
     @cached_property
@@ -53,5 +53,6 @@ class ImuCorrection:
     def _rate(self, rate: Float) -> Float:
         return rate + rate @ self.gyro.T
 
-    def _force(self, force: Float) -> Float:
+    def applied_force(self, force: Float) -> Float:
+        """Return corrected specific forces (..., 3)."""
         return force + (force - self.fixed_force) @ self.accel.T

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.kernels import await_compilers
+from graphvio.measurements.inertial_state import InertialState
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
@@ -70,6 +71,8 @@ class SelfCalibration:
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         upper_covariance: (C, C) covariance of the calibration if the rig file's standard deviations are all scaled by
             `MAX_FACTOR`; used by the innovation test.
+        inertial_state: at the newest keyframe that the calibration in force is based on, or None without an IMU, or
+            while the rig file is as good as exact.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
     """
@@ -88,6 +91,7 @@ class SelfCalibration:
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), at_first)
         self.extrinsics: dict[int, Float] = {}
         self.upper_covariance = upper_covariance
+        self.inertial_state: InertialState | None = None
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
         self._in_force = self._nominal
@@ -289,6 +293,7 @@ class SelfCalibration:
         self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
         self.upper_covariance = adjusted.upper_covariance
         self._in_force = self._nominal.moved(difference)
+        self.inertial_state = adjusted.inertial_state
 
     def _discard_window(self) -> None:
         self._collector.restart()

@@ -9,6 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.errors import RigError
+from graphvio.measurements.inertial_state import InertialState
 from graphvio.rig import Rig
 from graphvio.self_calibration.adjustment import adjusted
 from graphvio.self_calibration.estimate import CalibrationEstimate
@@ -23,6 +24,7 @@ from graphvio.self_calibration.evidence import (
     inexact,
 )
 from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.inertial_state import newest_inertial_state
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters
 from graphvio.self_calibration.prior import extrinsic_covariances
 from graphvio.self_calibration.solver import Solution
@@ -45,6 +47,7 @@ class AdjustedWindow(NamedTuple):
         upper_covariance: see there.
         covariance: (C, C) of the cameras' parameters that come into force.
         by_cameras: derivatives of the keyframes' poses with respect to the cameras' parameters.
+        inertial_state: at the last keyframe, or None without an IMU, or while the rig file is as good as exact.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -57,6 +60,7 @@ class AdjustedWindow(NamedTuple):
     upper_covariance: Float
     covariance: Float
     by_cameras: Float
+    inertial_state: InertialState | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +139,9 @@ class WindowAdjustment:
             anywhere,
             evidence.mean_square(self.file_prior, in_force, fitted.likelihood)[:n, :n],
             fitted.solution.poses_by_cameras(n),
+            None
+            if self.samples is None or estimate.is_file_exact
+            else newest_inertial_state(self.keyframes[-1].stamp_ns, fitted.solution),
         )
 
 
