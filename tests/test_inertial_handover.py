@@ -134,19 +134,27 @@ def standing() -> SmootherEstimator:
     for n in range(-9, 3):
         stamp_ns = BASE_NS + n * STEP_NS
         estimator.predict(stamp_ns, synchroniser.interval(stamp_ns - STEP_NS, stamp_ns))
-        estimator.update(stamp_ns, True, frozenset())
+        estimator.update(stamp_ns, True, frozenset([BASE_NS - 5 * STEP_NS]))
     return estimator
 
 
 def test_use_inertial_state_takes_over_what_is_known_better() -> None:
     estimator, state = standing(), known(1e-6 * np.eye(12))
-    before = estimator.state()
+    before, kept_ns = estimator.state(), BASE_NS - 5 * STEP_NS
+    motion, covariance = estimator.motion_since(kept_ns), estimator.covariance_since(kept_ns)
+    assert motion is not None
+    assert covariance is not None
     assert estimator.use_inertial_state(state)
     assert estimator.state().accel_bias == pytest.approx(state.accel_bias, abs=1e-6)
     assert estimator.state().gravity_nav == pytest.approx(before.nav_T_body[:3, :3] @ state.gravity, abs=0.01)
     assert estimator.state().nav_T_body == pytest.approx(before.nav_T_body, abs=1e-9)
-    assert estimator.initialisations == 2
+    assert estimator.initialisations == 1
     assert estimator.epoch == 0
+    # The next keyframe is tied to the one before.
+    assert estimator.motion_since(kept_ns) == pytest.approx(motion, abs=1e-4)
+    assert estimator.covariance_since(kept_ns) == pytest.approx(covariance, rel=1e-3, abs=1e-12)
+    estimator.predict(BASE_NS + 3 * STEP_NS, None)
+    assert estimator.motion_since(kept_ns) is None
 
 
 @pytest.mark.parametrize(

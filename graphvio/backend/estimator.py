@@ -195,15 +195,16 @@ class ImuFaultTolerant(Protocol):
         """
 
     def use_inertial_state(self, known: InertialState) -> bool:
-        """Go on with velocity, biases and gravity from a keyframe, if they are known about as well as the state's.
+        """Go on with velocity, biases and gravity from a keyframe that contradicts the state's.
 
-        Not while motions are being refused, or the IMU is left out.
+        Not if they are known much less well, or the keyframe has left the window; nor while the estimate is lost,
+        motions are refused, or the IMU is left out. Pose and epoch go on, and no event is reported.
 
         Args:
             known: At a keyframe, by its frameset's stamp.
 
         Returns:
-            Whether the state was reinitialised, so that later motions have to be measured from the newest frameset.
+            Whether the state was changed, so that later motions have to be measured from the newest frameset.
         """
 
     def distrust_prediction(self) -> None:

@@ -50,20 +50,28 @@ def g() -> int:
 def first_state(
     k: int, state: RigState, uncertainty: InitialUncertainty, with_imu: bool
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the priors of the first state, and with an IMU those of gravity."""
+    """Yield the priors of the first state; with a joint covariance they are those of gravity's direction, too."""
     yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(state.nav_T_body), gaussian(uncertainty.pose))
-    if not with_imu:
-        return
-    if uncertainty.inertial is not None:
+    if with_imu and uncertainty.inertial is not None:
         yield _inertial_prior(k, state, uncertainty.inertial)
-    else:
+    elif with_imu:
         yield gtsam.PriorFactorVector(v(k), state.velocity_nav, isotropic(3, uncertainty.velocity_m_s))
         sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
         yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-        along = np.outer(state.gravity_nav, state.gravity_nav)  # says next to nothing of the length
+
+
+def gravity(gravity_nav: Float, uncertainty: InitialUncertainty) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield the priors of gravity in nav: of its direction, unless `first_state` has it, and of its length.
+
+    Args:
+        gravity_nav: (3,) m/s^2.
+        uncertainty: of the first state.
+    """
+    if uncertainty.inertial is None:
+        along = np.outer(gravity_nav, gravity_nav)  # says next to nothing of the length
         floor = _MIN_GRAVITY_SIGMA_M_S2**2 * np.eye(3)
-        yield gtsam.PriorFactorVector(g(), state.gravity_nav, gaussian(uncertainty.gravity + along + floor))
+        yield gtsam.PriorFactorVector(g(), gravity_nav, gaussian(uncertainty.gravity + along + floor))
     yield gtsam.CustomFactor(isotropic(1, _GRAVITY_SIGMA_M_S2), [g()], _length_error)
 
 

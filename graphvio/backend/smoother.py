@@ -20,6 +20,7 @@ from graphvio.backend.factors import (
     constant_velocity,
     first_state,
     g,
+    gravity,
     imu_without_samples,
     position_reset,
     v,
@@ -96,6 +97,9 @@ class Smoother:
             self._window.values.insert(g(), state.gravity_nav)
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
+        if self.has_imu:
+            for factor in gravity(state.gravity_nav, uncertainty):
+                self._window.add(factor)
 
     def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
         """Predict the next state and append it: by the IMU, or without an interval of it by constant velocity."""

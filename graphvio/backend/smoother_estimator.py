@@ -80,6 +80,8 @@ class SmootherEstimator:
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
         self._sigma_m = 0.0  # of the position since vision last constrained it
         self._rebuilt_sigma_m = 0.0  # the same when the window was rebuilt since then
+        self._kept_ns: frozenset[int] = frozenset()  # states that motions are asked for from
+        self._carried: dict[int, tuple[Float, Float]] = {}  # motions since those that have been discarded
         self._final: list[tuple[int, Float]] = []
 
     @property
@@ -114,14 +116,14 @@ class SmootherEstimator:
         """Return ``now_T_then`` (4, 4) between two states of the window, or None if the earlier one has left it."""
         smoother = self._smoother
         if smoother is None or not smoother.knows(then_ns):
-            return None
+            return self._carried[then_ns][0] if then_ns in self._carried else None
         return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
 
     def covariance_since(self, then_ns: int) -> Float | None:
         """Return the joint posterior's covariance (6, 6) of that motion, or None if the window has none."""
         smoother = self._smoother
         if smoother is None or not smoother.knows(then_ns):
-            return None
+            return self._carried[then_ns][1] if then_ns in self._carried else None
         try:
             return smoother.covariance_since(then_ns)
         except SOLVER_ERRORS:
@@ -157,7 +159,7 @@ class SmootherEstimator:
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Extend the window by the IMU, or by constant velocity; a gap that neither bridges ends the epoch."""
-        self.gate_results = {}
+        self.gate_results, self._carried = {}, {}
         if interval is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
             self._reinitialise_after_gap(stamp_ns)
             return True
@@ -183,7 +185,7 @@ class SmootherEstimator:
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
         """Optimise the window and marginalise; one without a solution is rebuilt around the prediction."""
-        smoother, is_rebuilt = self._running, False
+        smoother, is_rebuilt, self._kept_ns = self._running, False, keep
         if is_constrained:
             self._tracked_ns = stamp_ns
         try:
@@ -242,11 +244,15 @@ class SmootherEstimator:
             self._rebuild(self.latest_ns, self.state(), error)
 
     def use_inertial_state(self, known: InertialState) -> bool:
-        """Go on with velocity, biases and gravity from a keyframe, if they are known about as well as the state's."""
+        """Go on with velocity, biases and gravity from a keyframe of the window that contradicts the state's.
+
+        They must be about as well known: their tilt by at most twice the standard deviation.
+        """
         smoother, tilt = self._running, self.covariance.tilt
-        if not self.has_imu or self._is_imu_left_out or self._refused or not smoother.knows(known.stamp_ns):
+        if not self.has_imu or self._is_imu_left_out or self._refused or self._status.is_lost or tilt is None:
             return False
-        if tilt is None or known.tilt_sigma_rad > _MAX_TILT_RATIO * np.sqrt(np.linalg.eigvalsh(tilt)[-1]):
+        is_known = known.tilt_sigma_rad < _MAX_TILT_RATIO * np.sqrt(np.linalg.eigvalsh(tilt)[-1])
+        if not is_known or not smoother.knows(known.stamp_ns):
             return False
         try:
             smoother.optimize()
@@ -259,11 +265,23 @@ class SmootherEstimator:
                 return False
             blind_s = 1e-9 * (smoother.latest_ns - self._tracked_ns)
             initial = with_inertial_state(known, then, smoother.latest_ns, now, blind_s, covariance)
-            self._reinitialise(initial, self.latest_ns - 1)
-            self.covariance = self._running.state_covariance()
+            self._carry_motions(initial.state.nav_T_body)
+            self._final += smoother.all_poses()[:-1]
+            smoother.initialise(initial.stamp_ns, initial.state, initial.uncertainty)
+            self._tracked_ns, self._rebuilt_sigma_m = initial.stamp_ns, self._sigma_m
+            self.covariance = smoother.state_covariance()
         except SOLVER_ERRORS as error:
             self._rebuild(self.latest_ns, self.state(), error)
         return True
+
+    def _carry_motions(self, nav_T_newest: Float) -> None:
+        """Keep the motions since the references and the last keyframe, until the next prediction."""
+        motions = {}
+        for then_ns in self._kept_ns:
+            covariance = self.covariance_since(then_ns)
+            if covariance is not None:
+                motions[then_ns] = (se3_inverse(nav_T_newest) @ self._running.pose(then_ns), covariance)
+        self._carried = motions
 
     def use_late_imu(self, motion: RelativeMotion, imu: tuple[ImuInterval, float]) -> None:
         """Use the IMU from now on, after an initialisation without: keep the newest pose, and take gravity from it.

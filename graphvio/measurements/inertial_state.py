@@ -16,8 +16,8 @@ class InertialState:
     Attributes:
         stamp_ns: of the frameset.
         velocity: (3,) m/s.
-        accel_bias: (3,) m/s^2, of readings that the calibration in force has corrected.
-        gyro_bias: (3,) rad/s, of such readings.
+        accel_bias: (3,) m/s^2, of what the readings are corrected to.
+        gyro_bias: (3,) rad/s, likewise.
         gravity: (3,) m/s^2, downwards.
         covariance: (12, 12) of ``[velocity, accel_bias, gyro_bias, gravity]``.
     """

@@ -62,7 +62,9 @@ def adjusted(
     outliers = np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2)  # single samples, or an axis that sticks
     if samples is not None and len(outliers):
         samples = samples.without(outliers)
-    if len(outliers) or not np.array_equal(noise_px, tracks.sigma_px):
+    if len(outliers):  # from the first states again, which they have not taken along
+        solution = solve(Window(tracks._replace(sigma_px=noise_px), samples), states, nominal, difference, prior)
+    elif not np.array_equal(noise_px, tracks.sigma_px):
         window = Window(solution.window.tracks._replace(sigma_px=noise_px), samples)
         solution = solve(window, solution.states, nominal, solution.calibration.mean, prior)
     return solution

@@ -46,13 +46,13 @@ class ImuCorrection:
             linear_acceleration=self.applied_force(interval.linear_acceleration),
         )
 
+    def applied_force(self, force: Float) -> Float:
+        """Return corrected specific forces (..., 3)."""
+        return force + (force - self.fixed_force) @ self.accel.T
+
     @cached_property
     def _is_none(self) -> bool:
         return not self.gyro.any() and not self.accel.any()
 
     def _rate(self, rate: Float) -> Float:
         return rate + rate @ self.gyro.T
-
-    def applied_force(self, force: Float) -> Float:
-        """Return corrected specific forces (..., 3)."""
-        return force + (force - self.fixed_force) @ self.accel.T

@@ -27,8 +27,11 @@ def newest_inertial_state(stamp_ns: int, solution: Solution) -> InertialState:
         solution: of the window, with an IMU.
 
     Returns:
-        The state, with biases of readings as they are measured: errors of the matrices are a part of them, at a rate of
-        zero and at the force of gravity.
+        The state. Its biases are those of readings whose matrices have no errors: what these errors do at a rate of
+        zero and at the force of gravity is a part of the biases.
+
+    Raises:
+        numpy.linalg.LinAlgError: if its covariance is not positive definite.
     """
     states, n = solution.states, len(solution.states.poses)
     imu_at = 6 * n + len(solution.calibration.mean) - PARAMETERS
@@ -50,6 +53,7 @@ def newest_inertial_state(stamp_ns: int, solution: Solution) -> InertialState:
     by_states[9:, pose_at : pose_at + 3] = skew(gravity)
     by_states[9:, -3:] = body_R_odom
     covariance: Float = by_states @ solve_rows(solution.hessian, by_states).T
+    np.linalg.cholesky(covariance)
     return InertialState(
         stamp_ns,
         velocity,

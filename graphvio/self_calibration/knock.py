@@ -79,6 +79,8 @@ def _offset_sigma_px(view: View, calibration: RigCalibration, pair: int, covaria
     of_own = covariance[np.ix_(own, own)]
     gradient = np.zeros(len(own))
     for k, sigma in enumerate(np.sqrt(np.diag(of_own))):
+        if sigma == 0.0:
+            continue
         step = np.zeros(len(covariance))
         for sign in (1.0, -1.0):
             step[own[k]] = sign * sigma

@@ -95,6 +95,7 @@ class SelfCalibration:
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
         self._in_force = self._nominal
+        self._in_force_covariance = self._prior.covariance[: self._n_camera_parameters, : self._n_camera_parameters]
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
@@ -292,7 +293,7 @@ class SelfCalibration:
         self._consider.set_calibration_in_force(difference, adjusted.covariance, self._since_newest())
         self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
         self.upper_covariance = adjusted.upper_covariance
-        self._in_force = self._nominal.moved(difference)
+        self._in_force, self._in_force_covariance = self._nominal.moved(difference), adjusted.covariance
         self.inertial_state = adjusted.inertial_state
 
     def _discard_window(self) -> None:
@@ -308,8 +309,7 @@ class SelfCalibration:
         """Return the pairs that have been knocked, by what a keyframe adds; none while too little is known of them."""
         if not (self.is_confirmed or self.estimate.is_file_exact):
             return []
-        n = self._n_camera_parameters
-        return self._knocks.update(views, self._in_force, self.estimate.posterior.covariance[:n, :n])
+        return self._knocks.update(views, self._in_force, self._in_force_covariance)
 
     def _refuse(self, is_full: bool) -> None:
         """Discard a window that contradicts those before it; several such windows are a knock."""

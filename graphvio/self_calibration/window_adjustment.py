@@ -30,7 +30,7 @@ from graphvio.self_calibration.prior import extrinsic_covariances
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe
 
-_MAX_CHANGE = 2.0  # of the file's factors, with which a window is not adjusted again
+_MIN_CHANGE = 0.5  # of the file's factors, down to which a window is not adjusted again
 
 
 class AdjustedWindow(NamedTuple):
@@ -96,8 +96,8 @@ class WindowAdjustment:
         try:
             fitted = self._fitted(self.factors, self.difference)
             change = inexact(fitted.factors) / inexact(self.factors)
-            if fitted.solution.has_converged and (np.maximum(change, 1.0 / change) > _MAX_CHANGE).any():
-                # What the window says was linearised where quite another file led it.
+            if fitted.solution.has_converged and ((change > 1.0) | (change < _MIN_CHANGE)).any():
+                # What the window says was linearised where quite another file led it, or a file that is less exact.
                 fitted = self._fitted(fitted.factors, fitted.solution.calibration.mean)
             return self._judged(fitted) if fitted.solution.has_converged else None
         except (np.linalg.LinAlgError, RigError):
@@ -128,6 +128,8 @@ class WindowAdjustment:
         )
         _ = estimate.rig  # build the rig now: it raises RigError here rather than later in the odometry's thread
         anywhere = evidence.given(self.file_prior, np.full_like(factors, MAX_FACTOR)).covariance
+        has_inertial_state = self.samples is not None and not estimate.is_file_exact
+        newest_ns = self.keyframes[-1].stamp_ns
         return AdjustedWindow(
             self.keyframes,
             self.is_full,
@@ -139,9 +141,7 @@ class WindowAdjustment:
             anywhere,
             evidence.mean_square(self.file_prior, in_force, fitted.likelihood)[:n, :n],
             fitted.solution.poses_by_cameras(n),
-            None
-            if self.samples is None or estimate.is_file_exact
-            else newest_inertial_state(self.keyframes[-1].stamp_ns, fitted.solution),
+            newest_inertial_state(newest_ns, fitted.solution) if has_inertial_state else None,
         )
 
 
