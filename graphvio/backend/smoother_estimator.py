@@ -44,7 +44,7 @@ _MIN_AGAINST_STANDSTILL = 3  # rejected motions, soon after an initialisation at
 _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
 _MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
-_MIN_OFF2 = 12.0  # squared Mahalanobis distance of a state, of 12 dimensions, that is not kept
+_MIN_OFF2 = 21.0  # squared Mahalanobis distance of a state, of 12 dimensions, that is not kept: 5 % exceed it by chance
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
