@@ -211,12 +211,10 @@ def with_inertial_state(
     to_now[:3, :3] = to_now[9:, 9:] = nav_R_then
     to_now[:3, 3:6], to_now[:3, 9:] = -since_s * nav_R_now, since_s * nav_R_then
     inertial = to_now @ known.covariance @ to_now.T
+    sigmas = np.sqrt(np.diag(inertial))
+    velocity_sigma, gyro_bias_sigma = float(sigmas[:3].max()), float(sigmas[6:9].max())
     uncertainty = InitialUncertainty(
-        certain_origin(),
-        float(np.sqrt(np.linalg.eigvalsh(inertial[:3, :3])[-1])),
-        0.0,
-        covariance.pose,
-        inertial=inertial,
+        certain_origin(), velocity_sigma, gyro_bias_sigma, covariance.pose, inertial=inertial
     )
     return InitialState(now_ns, state, uncertainty)
 

@@ -29,7 +29,6 @@ from graphvio.self_calibration.parameters import n_camera_parameters
 
 _MAX_TURN_RAD = np.deg2rad(0.3)  # a larger correction of the cameras' attitude begins a new keyframe
 _DISTRUST_SIGMAS = 5.0  # if an IMU parameter changes by more than this, predictions made before are wrong
-_KEPT_STAMPS = 100  # framesets: a calibration comes into force sooner after its newest keyframe
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
 
 
@@ -68,7 +67,6 @@ class PairsCalibration:
         self._is_refusal_reported = False
         self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()  # pairs
-        self._stamp_of: dict[int, int] = {}  # instant -> stamp, of the newest framesets
         self._calibration = SelfCalibration(rig)
         self._motion: RelativeMotion | None = None  # by vision, of the newest frameset
         self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
@@ -142,9 +140,6 @@ class PairsCalibration:
         tolerant = self._imu_fault_tolerant
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)
-        self._stamp_of[instant_ns] = stamp_ns
-        if len(self._stamp_of) > _KEPT_STAMPS:
-            del self._stamp_of[next(iter(self._stamp_of))]
         calibration.add_frameset(instant_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:
@@ -204,9 +199,9 @@ class PairsCalibration:
         The estimator has taken errors of the calibration for motion until now; to the window they are unknowns.
         """
         known, tolerant = self._calibration.inertial_state, self._imu_fault_tolerant
-        if known is None or tolerant is None or known.stamp_ns not in self._stamp_of:
+        if known is None or tolerant is None:
             return
-        stamp_ns, force = self._stamp_of[known.stamp_ns], -known.gravity
+        stamp_ns, force = self._synchroniser.stamp_ns(known.stamp_ns), -known.gravity
         bias = known.accel_bias + self._synchroniser.imu_correction.applied_force(force) - force
         if tolerant.use_inertial_state(replace(known, stamp_ns=stamp_ns, accel_bias=bias)):
             self._frontend.start_keyframe()

@@ -174,6 +174,10 @@ class Synchroniser:
         """Return when the images of a frameset were taken: its stamp, but for what `set_lateness` has corrected."""
         return self._instants_ns.get(stamp_ns, stamp_ns)
 
+    def stamp_ns(self, instant_ns: int) -> int:
+        """Return the stamp of a recent frameset whose images were taken at an instant; the inverse of `instant_ns`."""
+        return next((stamp_ns for stamp_ns, at_ns in self._instants_ns.items() if at_ns == instant_ns), instant_ns)
+
     def finish(self) -> None:
         """Leave out what was not confirmed, as no measurement follows."""
         self._sample_jumps.end()

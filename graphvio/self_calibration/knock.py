@@ -43,9 +43,8 @@ class KnockDetector:
             if offset_px is None:
                 continue
             known_px = self._off_px.pop(j, [])
-            if abs(offset_px) > _MAX_OFFSET_PX and abs(offset_px) > _MAX_SIGMAS * _offset_sigma_px(
-                view, calibration, j, covariance
-            ):
+            is_large = abs(offset_px) > _MAX_OFFSET_PX
+            if is_large and abs(offset_px) > _MAX_SIGMAS * _offset_sigma_px(view, calibration, j, covariance):
                 lasts = all(abs(offset_px - known) <= _MAX_CHANGE * abs(offset_px) for known in known_px)
                 self._off_px[j] = [*known_px, offset_px] if lasts else [offset_px]
         knocked = [j for j, offsets in self._off_px.items() if len(offsets) >= _CONFIRMED]
@@ -56,10 +55,11 @@ class KnockDetector:
 
 def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float | None:
     """Return how far a pair's matches are beside their epipolar lines in the median, None where there are few."""
-    matched = view.has_right
-    if matched.sum() < _MIN_MATCHES:
-        return None
-    rays = []
+    return None if view.has_right.sum() < _MIN_MATCHES else _offset_px(view, calibration, pair)
+
+
+def _offset_px(view: View, calibration: RigCalibration, pair: int) -> float:
+    matched, rays = view.has_right, []
     for which, pixels in enumerate((view.left_px, view.right_px)):
         normalised, _ = unproject_pixels(
             int(calibration.models[pair, which]), calibration.intrinsics[pair, which],
@@ -74,7 +74,7 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
 
 
 def _offset_sigma_px(view: View, calibration: RigCalibration, pair: int, covariance: Float) -> float:
-    """Return the standard deviation of `epipolar_offset_px` by what is known of the calibration."""
+    """Return the standard deviation of `epipolar_offset_px`, by the covariance (C, C) of all cameras' parameters."""
     own = np.flatnonzero(calibration.columns // PAIR == pair)
     of_own = covariance[np.ix_(own, own)]
     gradient = np.zeros(len(own))
@@ -84,7 +84,7 @@ def _offset_sigma_px(view: View, calibration: RigCalibration, pair: int, covaria
         step = np.zeros(len(covariance))
         for sign in (1.0, -1.0):
             step[own[k]] = sign * sigma
-            gradient[k] += sign * (epipolar_offset_px(view, calibration.moved(step), pair) or 0.0) / (2.0 * sigma)
+            gradient[k] += sign * _offset_px(view, calibration.moved(step), pair) / (2.0 * sigma)
     return float(np.sqrt(gradient @ of_own @ gradient))
 
 

@@ -128,8 +128,9 @@ class WindowAdjustment:
         )
         _ = estimate.rig  # build the rig now: it raises RigError here rather than later in the odometry's thread
         anywhere = evidence.given(self.file_prior, np.full_like(factors, MAX_FACTOR)).covariance
-        has_inertial_state = self.samples is not None and not estimate.is_file_exact
-        newest_ns = self.keyframes[-1].stamp_ns
+        inertial_state = None
+        if self.samples is not None and not estimate.is_file_exact:
+            inertial_state = newest_inertial_state(self.keyframes[-1].stamp_ns, fitted.solution)
         return AdjustedWindow(
             self.keyframes,
             self.is_full,
@@ -141,7 +142,7 @@ class WindowAdjustment:
             anywhere,
             evidence.mean_square(self.file_prior, in_force, fitted.likelihood)[:n, :n],
             fitted.solution.poses_by_cameras(n),
-            newest_inertial_state(newest_ns, fitted.solution) if has_inertial_state else None,
+            inertial_state,
         )
 
 
