@@ -15,7 +15,7 @@ from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_monotonic,
 from graphvio.live.devices import Counts, DeviceLostError, DeviceSource, HandOver, Mailbox
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.sources import SourceSpec
-from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
+from graphvio.live.sources.spec_options import choice_of, names_of, number_of, size_of
 from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig

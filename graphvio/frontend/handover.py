@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.frontend.tracker import GroupTracker
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.measurements.motion import HandedOverTracks
-
-if TYPE_CHECKING:
-    from graphvio.frontend.tracker import GroupTracker
 
 
 class Leaving(NamedTuple):

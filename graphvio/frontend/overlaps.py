@@ -5,23 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.handover import FoundThere, Leaving
-from graphvio.frontend.lucas_kanade import Pyramid
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.prediction import predict_pixels
+from graphvio.frontend.tracker import GroupTracker, TrackedImage
 from graphvio.frontend.tracks import TrackedFrame
 from graphvio.frontend.warped_matching import WarpedMatcher
 from graphvio.measurements.motion import CrossCameraMatches
 from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, axes_angle_deg, overlap
-
-if TYPE_CHECKING:
-    from graphvio.frontend.tracker import GroupTracker
 
 MIN_OVERLAP = 0.1
 """Smallest share of an image that is searched for in another camera's."""
@@ -29,23 +25,6 @@ MIN_OVERLAP = 0.1
 
 _MAX_HANDOVER_OVERLAP = 0.4  # of what a camera shares with any other one
 _MAX_SIGMAS = 3.0
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedImage:
-    """The newest image of a camera, and what is tracked in it.
-
-    Attributes:
-        frame: the tracks.
-        pyramid: of the image, of two levels at least.
-        allowed: (height, width) where it may be used.
-        min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
-    """
-
-    frame: TrackedFrame
-    pyramid: Pyramid
-    allowed: Bool
-    min_gradient: float
 
 
 @dataclass(frozen=True, eq=False)

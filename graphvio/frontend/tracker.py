@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from graphvio.frontend.lost_tracks import image_shift, motion_of_found
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
-from graphvio.frontend.overlaps import TrackedImage
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines
 from graphvio.frontend.tracks import TrackedFrame, common_rows, passes, usable_at
@@ -28,6 +27,23 @@ _MAX_ROUNDS = 3
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FRAMES_WITHOUT_DEPTH = 3  # then the track is dropped for another corner of its cell
 _LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks that fail are tried again with all
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedImage:
+    """The newest image of a camera, and what is tracked in it.
+
+    Attributes:
+        frame: the tracks.
+        pyramid: of the image, of two levels at least.
+        allowed: (height, width) where it may be used.
+        min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
+    """
+
+    frame: TrackedFrame
+    pyramid: Pyramid
+    allowed: Bool
+    min_gradient: float
 
 
 class GroupTracker:

@@ -10,8 +10,7 @@ from typing import Any
 from graphvio.errors import MissingExtraError, SessionError
 from graphvio.sessions import cdr, ros1
 from graphvio.sessions.messages import STAMPED
-from graphvio.sessions.store import Store
-from graphvio.sessions.topics import Place, Topic
+from graphvio.sessions.topics import Place, Store, Topic
 
 try:
     from rosbags.highlevel import AnyReader, AnyReaderError

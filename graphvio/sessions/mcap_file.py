@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from graphvio.errors import MissingExtraError, SessionError
-from graphvio.sessions.store import Store
-from graphvio.sessions.topics import Place, Topic
+from graphvio.sessions.topics import Place, Store, Topic
 
 try:
     from mcap.exceptions import McapError

@@ -11,8 +11,7 @@ from graphvio.arrays import Int
 from graphvio.errors import SessionError
 from graphvio.sessions import cdr
 from graphvio.sessions.mcap_storage import LIBRARY
-from graphvio.sessions.store import Store
-from graphvio.sessions.topics import Place, Topic
+from graphvio.sessions.topics import Place, Store, Topic
 
 _BLOCKS = 10
 _MIN_MESSAGES = 5 * _BLOCKS

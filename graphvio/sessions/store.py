@@ -2,40 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 
-from graphvio.sessions.topics import Place, Topic
+from graphvio.sessions.topics import Store
 
 SUFFIXES = (".mcap", ".bag", ".db3")
 """Of files that are sessions or bags by themselves: MCAP, ROS 1, and ROS 2 with SQLite."""
-
-
-class Store(ABC):
-    """A session or bag, for any number of threads; a `graphvio.sessions.topics.MessageReader`."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path  # of the file, or of the folder of a ROS 2 bag
-        self.topics: dict[str, Topic] = {}  # by name
-        self.library = ""  # that wrote it; empty for bags
-        self.attachments: dict[str, bytes] = {}  # by name; none in bags
-        self.is_whole = True  # whether its writing was finished
-        self.damages: list[str] = []  # one line for each record that cannot be used
-        self.has_damaged_attachment = False  # whether an attachment is among them
-
-    @abstractmethod
-    def read(self, place: Place) -> bytes:
-        """Return a message as CDR.
-
-        Raises:
-            SessionError: if it is damaged.
-        """
-
-    @property
-    def damaged_chunks(self) -> int:
-        """How many of the chunks that have been read so far are damaged; bags have none."""
-        return 0
 
 
 def is_store(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -117,3 +118,29 @@ def camera_of(topic: str, sides: tuple[str, ...]) -> str:
 
 def _is_compressed(parts: list[str]) -> bool:
     return parts[-1] in ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
+
+
+class Store(ABC):
+    """A session or bag, for any number of threads; a `graphvio.sessions.topics.MessageReader`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path  # of the file, or of the folder of a ROS 2 bag
+        self.topics: dict[str, Topic] = {}  # by name
+        self.library = ""  # that wrote it; empty for bags
+        self.attachments: dict[str, bytes] = {}  # by name; none in bags
+        self.is_whole = True  # whether its writing was finished
+        self.damages: list[str] = []  # one line for each record that cannot be used
+        self.has_damaged_attachment = False  # whether an attachment is among them
+
+    @abstractmethod
+    def read(self, place: Place) -> bytes:
+        """Return a message as CDR.
+
+        Raises:
+            SessionError: if it is damaged.
+        """
+
+    @property
+    def damaged_chunks(self) -> int:
+        """How many of the chunks that have been read so far are damaged; bags have none."""
+        return 0

@@ -13,8 +13,8 @@ from graphvio.rig import Rig
 from graphvio.sessions.messages import COMPRESSED, IMAGE, STAMPED
 from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.stamps import Clock, Offset, all_header_stamps, compare_clocks, compare_topics
-from graphvio.sessions.store import Store, is_store, open_store
-from graphvio.sessions.topics import Topic
+from graphvio.sessions.store import is_store, open_store
+from graphvio.sessions.topics import Store, Topic
 from graphvio.sources.session import rig_in
 
 _GAP_PERIODS = 1.5

@@ -18,10 +18,10 @@ from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, TEXT, imu_sample,
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.stamps import header_stamps
-from graphvio.sessions.store import Store
 from graphvio.sessions.topics import (
     RIG_ATTACHMENT,
     RIG_TOPIC,
+    Store,
     Topic,
     camera_of,
     image_topic,

@@ -18,8 +18,8 @@ from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_realtime
 from graphvio.live.devices import HandOver
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
+from graphvio.live.sources.spec_options import choice_of, number_of, size_of
 from graphvio.live.sources.stereo_cameras import StereoCamera, has_imu, open_cameras
-from graphvio.live.spec_options import choice_of, number_of, size_of
 from graphvio.measurements.readings import CameraFrame, ImuReading, host_ns
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 

@@ -12,7 +12,7 @@ import numpy as np
 from graphvio.errors import SourceError
 from graphvio.live.source import DeviceInfo
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.spec_options import number_of
+from graphvio.live.sources.spec_options import number_of
 from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig

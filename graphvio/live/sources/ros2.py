@@ -11,7 +11,7 @@ from graphvio.arrays import Float
 from graphvio.errors import SourceError
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.spec_options import choice_of, number_of
+from graphvio.live.sources.spec_options import choice_of, number_of
 from graphvio.measurements.readings import DeviceHealth, ImuReading, Reading
 from graphvio.rig import Rig
 from graphvio.ros2.node import Node, Publication, domain_of

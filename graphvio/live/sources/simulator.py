@@ -26,7 +26,7 @@ from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.replay import Pace, paced, speed_of
 from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
 from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
-from graphvio.live.spec_options import choice_of, number_of, whole_number_of
+from graphvio.live.sources.spec_options import choice_of, number_of, whole_number_of
 from graphvio.measurements.readings import DeviceHealth, Reading
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig

@@ -12,7 +12,7 @@ from graphvio.errors import RigError, SourceError
 from graphvio.live.devices import Counts, DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.sources import SourceSpec
-from graphvio.live.spec_options import choice_of, names_of
+from graphvio.live.sources.spec_options import choice_of, names_of
 from graphvio.measurements.readings import host_ns
 from graphvio.rig import Rig
 from graphvio.rig_files import joined_rig

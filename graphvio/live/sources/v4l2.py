@@ -27,7 +27,7 @@ from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.serial_imu import SerialImu
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
+from graphvio.live.sources.spec_options import choice_of, names_of, number_of, size_of
 from graphvio.measurements.readings import CameraFrame, host_ns
 from graphvio.rig import Camera, Rig
 
