@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.references import References
-from graphvio.frontend.refinement import Refined
 from graphvio.frontend.tracks import TrackedFrame
 
 NEAR, FAR = 0.5, 0.01  # 1/m
@@ -36,16 +35,15 @@ def frame(stamp_ns: int, inverse_depths: Float, first_id: int = 0) -> TrackedFra
     )
 
 
-def explained(correspondences: Correspondences) -> Refined:
-    n = len(correspondences.observations.pair)
-    return Refined(np.eye(4), np.eye(6), np.eye(6), np.ones(n, dtype=bool), np.zeros(n))
+def explained(correspondences: Correspondences) -> Bool:
+    return np.ones(len(correspondences.observations.pair), dtype=bool)
 
 
 def spent(reference: TrackedFrame, newest: TrackedFrame) -> bool:
     references = References(MotionConfig())
     references.replace({0: reference})
     correspondences = correspond({0: reference}, {0: newest})
-    return references.must_be_replaced({0: newest}, correspondences, explained(correspondences), is_contradicted=False)
+    return references.must_be_replaced({0: newest}, correspondences, explained(correspondences))
 
 
 @pytest.mark.parametrize(("near_left", "expected"), [(30, False), (20, False), (8, True)])

@@ -256,6 +256,10 @@ class Smoother:
         """Insert a relative motion that ends in the newest state."""
         self._constrained_ns = self._seen_ns = motion.stamp_ns
         self._rate_sigmas = np.zeros(2)
+        self.add_partial_motion(motion)
+
+    def add_partial_motion(self, motion: RelativeMotion) -> None:
+        """Insert a relative motion that need not constrain the newest state in all directions."""
         k = self._index_of[motion.reference_stamp_ns]
         self._views.add(k, motion, self._window)
         reference, covariance = self._views.seen(k, motion)

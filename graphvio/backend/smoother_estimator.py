@@ -45,6 +45,7 @@ _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is 
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
 _MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
 _MIN_OFF2 = 21.0  # squared Mahalanobis distance of a state, of 12 dimensions, that is not kept: 5 % exceed it by chance
+_MAX_PARTIAL_STATISTIC = 12.6  # squared Mahalanobis distance, of 6 dimensions: 5 % exceed it by chance
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
@@ -75,6 +76,7 @@ class SmootherEstimator:
         self._is_chain_after_gap = False  # whether these begin at a state that the IMU alone has led to
         self._imu_failed = False  # samples were missing after the first rejected motion
         self._is_distrusted = False  # calibration of the IMU or initial state proved to be wrong
+        self._are_points_wrong = False  # the few ones of partial motions, since vision was last accepted
         self._is_imu_left_out = False
         self._is_standstill_assumed = False  # by the IMU alone, which does not see a steady motion
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
@@ -307,6 +309,7 @@ class SmootherEstimator:
         """Insert the motion if it passes the gate; reinitialise after lost, or once it was refused for too long."""
         smoother, motion = self._running, visual.motion
         if motion is None:
+            self._apply_partial_motion(visual.partial_motion)
             return MeasurementUpdate(None)
         if not smoother.knows(motion.reference_stamp_ns):  # the state was reinitialised since then
             return MeasurementUpdate(None, needs_keyframe=True)
@@ -327,6 +330,16 @@ class SmootherEstimator:
             # Vision that contradicts itself cannot refute the prediction, but for a standstill that is only assumed.
             return MeasurementUpdate(None)
         return self._refuse(motion)
+
+    def _apply_partial_motion(self, motion: RelativeMotion | None) -> None:
+        """Let few points correct the state that the IMU predicts, if they pass the gate; vision fails all the same."""
+        is_predicted = self.has_imu and not (self._is_imu_left_out or self._refused or self._status.is_lost)
+        if motion is None or not is_predicted or not self._running.knows(motion.reference_stamp_ns):
+            return
+        # Few points may all be on somebody who walks by. The IMU shows it the sooner, the stricter the test.
+        self._are_points_wrong |= self._running.gate(motion).statistic > _MAX_PARTIAL_STATISTIC
+        if not self._are_points_wrong:
+            self._running.add_partial_motion(motion)
 
     def _accept(self, motion: RelativeMotion) -> MeasurementUpdate:
         """Insert a motion that passes the gate; reinitialise if it begins at a state whose own motion was refused."""
@@ -479,7 +492,7 @@ class SmootherEstimator:
     def _note_accepted(self) -> None:
         """Record that vision is accepted: nothing is refused any more, and the estimate is not lost."""
         self._refused.clear()
-        self._imu_failed = self._is_distrusted = False
+        self._imu_failed = self._is_distrusted = self._are_points_wrong = False
         self._status.is_lost = False
 
     @property

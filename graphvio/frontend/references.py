@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from graphvio.arrays import Int
+from graphvio.arrays import Bool, Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences
-from graphvio.frontend.refinement import Refined
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.rig import Rig
@@ -64,11 +63,7 @@ class References:
         return groups[max(groups, key=lambda stamp_ns: (in_view(stamp_ns), stamp_ns))]
 
     def must_be_replaced(
-        self,
-        frames: Mapping[int, TrackedFrame],
-        correspondences: Correspondences,
-        refined: Refined,
-        is_contradicted: bool,
+        self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
     ) -> bool:
         """Decide whether the next motions are measured from the newest frames.
 
@@ -78,26 +73,23 @@ class References:
         Args:
             frames: Newest frame of each pair.
             correspondences: Points of them that the references have, too.
-            refined: The motion.
-            is_contradicted: Whether more than one motion is seen. Many short motions soonest show which one is right.
+            inlier: (N,) The points that the motion explains.
         """
         if self._config.reference == "previous":
-            return True
-        if is_contradicted:
             return True
         if any(j not in correspondences.rows for j in frames):
             return True  # a pair that came back takes part again from the next frameset on
         pair, overlap = correspondences.observations.pair, self._config.keyframe_overlap
-        explained = {int(j) for j in np.flatnonzero(np.bincount(pair[refined.inlier]))}
-        support, candidates = int(refined.inlier.sum()), sum(correspondences.candidates[j] for j in explained)
-        if support < overlap * candidates or support < _T.min_points:
+        explained = {int(j) for j in np.flatnonzero(np.bincount(pair[inlier]))}
+        support, candidates = int(inlier.sum()), sum(correspondences.candidates[j] for j in explained)
+        if support < overlap * candidates:
             return True
-        seen = correspondences.identities(frames, refined.inlier)
+        seen = correspondences.identities(frames, inlier)
         if self._share_of_near_points({j: seen[j] for j in explained}) < _T.min_near_share * overlap:
             return True
         # One pair may have lost its points long before all points together are few.
         for j, frame in frames.items():
-            usable = refined.inlier[pair == j] if j in explained else pair == j
+            usable = inlier[pair == j] if j in explained else pair == j
             if usable.sum() < _T.min_pair_share * overlap * frame.has_depth.sum():
                 return True
         return False

@@ -9,11 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.depth_errors import by_depth_errors
 from graphvio.frontend.depth_scale import is_of_singles, with_free_length
+from graphvio.frontend.few_points import FewPoints, fit_few_points
 from graphvio.frontend.images import ImageMask
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
 from graphvio.frontend.quality import CheckedHypothesis, checked_hypothesis, motion_with_quality, stereo_share
@@ -26,6 +27,8 @@ from graphvio.geometry import se3_inverse, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 from graphvio.timing import timed
+
+_MIN_NOISE_SHARE = 0.5  # of the modelled noise: matches of the few corners before blank walls are no better
 
 
 class _JudgedMotion(NamedTuple):
@@ -57,6 +60,7 @@ class VisualFrontend(TrackingFrontend):
         file_error_share = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
         error_share = float(np.hypot(config.motion.shared_error_share, file_error_share))
         self._scale_sigma = 0.0 if rig.imu is None else error_share
+        self._noise_px = config.motion.pixel_sigma_px  # of the last good motion's points
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
 
     @property
@@ -88,16 +92,20 @@ class VisualFrontend(TrackingFrontend):
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset."""
         agreement, reason = self._estimate_motion(seen, motion_since)
+        few = self._fit_few_points(seen, motion_since) if agreement is None else None
         judged = self._judge(seen, agreement, reason, motion_since)
+        if agreement is not None and judged.quality is Quality.GOOD:
+            self._noise_px = self._shown_noise_px(agreement)
         is_stationary = self._detect_standstill(seen, agreement)
         self._drop_outliers(seen, agreement)
-        replenished, own = self._start_keyframe_if_due(seen, agreement, motion_since)
+        replenished, own = self._start_keyframe_if_due(seen, agreement, few, motion_since)
         return VisualResult(
             judged.motion,
             judged.quality,
             judged.reason,
             pair_reports(seen.frames if seen.reference else replenished, seen.correspondences, agreement, replenished),
             alternatives=judged.alternatives,
+            partial_motion=None if few is None else self._partial_motion(seen, few),
             own=own,
             is_stationary=is_stationary,
             frozen=seen.frozen.pairs,
@@ -129,6 +137,25 @@ class VisualFrontend(TrackingFrontend):
         if not is_supported(best.refined.inlier[rows], config):
             return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"
         return agreement, ""
+
+    @timed("motion")
+    def _fit_few_points(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> FewPoints | None:
+        """Correct the predicted motion by points that are too few for a motion, if an IMU predicts it.
+
+        Where corners are not found in the right images, the few that are may be wrong all alike: they do not count.
+        """
+        observations = seen.correspondences.observations
+        is_few = seen.reference and 0 < len(observations.pair) < self._config.motion.min_inliers
+        if not is_few or self._rig.imu is None or seen.frozen.all_since_ns is not None:
+            return None
+        if stereo_share(seen.reference, seen.frames, self._baselines_m).share < THRESHOLDS.quality.min_stereo_share:
+            return None
+        predicted = motion_since(seen.reference_stamp_ns)
+        if predicted is None:
+            return None
+        return fit_few_points(
+            self._extrinsics.arrays, observations, predicted, self._noise_px, self._config.motion.max_error_px
+        )
 
     @timed("quality")
     def _judge(
@@ -171,9 +198,13 @@ class VisualFrontend(TrackingFrontend):
 
     @timed("replenish")
     def _start_keyframe_if_due(
-        self, seen: TrackedFrameset, agreement: Agreement | None, motion_since: MotionPredictor
+        self,
+        seen: TrackedFrameset,
+        agreement: Agreement | None,
+        few: FewPoints | None,
+        motion_since: MotionPredictor,
     ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
-        """Start a keyframe with new corners if one is due, or if there is no motion.
+        """Start a keyframe with new corners if one is due, or if no point shows the motion.
 
         The keyframe that ends corrects where the pairs are to each other, if they have shown it.
 
@@ -182,9 +213,11 @@ class VisualFrontend(TrackingFrontend):
             keyframe goes on.
         """
         if agreement is None:
-            return self._refer_to(seen.frames), {}
+            is_due = few is None or self._is_keyframe_due(seen, few.inlier)
+            return (self._refer_to(seen.frames) if is_due else {}), {}
         refined, is_contradicted = agreement.hypotheses[0].refined, len(agreement.hypotheses) > 1
-        if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
+        # Where pairs contradict each other, many short motions soonest show which one is right.
+        if not is_contradicted and not self._is_keyframe_due(seen, refined.inlier):
             return {}, {}
         own = self._own_motions(seen, agreement)
         self._extrinsics.learn(agreement.own)
@@ -193,6 +226,15 @@ class VisualFrontend(TrackingFrontend):
         return self._refer_to(seen.frames), own
 
     # ------------------------------------------------------------------ parts of these steps
+
+    def _shown_noise_px(self, agreement: Agreement) -> float:
+        """Return the noise of a pixel as the points of a motion show it, and a bit more, as in its covariance."""
+        config = self._config.motion
+        rms_px = agreement.hypotheses[0].refined.rms_px() or config.pixel_sigma_px
+        return max(config.sigma_inflation * rms_px, _MIN_NOISE_SHARE * config.pixel_sigma_px)
+
+    def _is_keyframe_due(self, seen: TrackedFrameset, inlier: Bool) -> bool:
+        return self._references.must_be_replaced(seen.frames, seen.correspondences, inlier)
 
     def _advance_histories(self, seen: TrackedFrameset, refined: Refined, motion_since: MotionPredictor) -> None:
         """Note the motion over the keyframe that ends, by which single cameras locate points."""
@@ -234,7 +276,21 @@ class VisualFrontend(TrackingFrontend):
             int(refined.inlier.sum()),
         )
 
-    def _with_depth_errors(self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined) -> RelativeMotion:
+    def _partial_motion(self, seen: TrackedFrameset, few: FewPoints) -> RelativeMotion:
+        motion = RelativeMotion(
+            seen.reference_stamp_ns,
+            seen.stamp_ns,
+            se3_inverse(few.cur_T_ref),
+            few.covariance,
+            np.zeros((6, 6)),
+            int(few.inlier.sum()),
+            pairs=seen.correspondences.observations.of_rows(few.inlier).pairs,
+        )
+        return self._with_depth_errors(motion, seen, few)
+
+    def _with_depth_errors(
+        self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
+    ) -> RelativeMotion:
         """Add derivatives with respect to errors of the pairs' depths, which the innovation test needs."""
         if not self._config.estimates_calibration or self._rig.imu is None:
             return motion

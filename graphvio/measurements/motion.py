@@ -69,7 +69,8 @@ class RelativeMotion:
             Zero for pairs that did not measure it, None where errors of pairs are not estimated.
         calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
             where they add nothing. Innovation tests allow for it.
-        pairs: Of one of several hypotheses, indices of the pairs and single cameras whose motion it is.
+        pairs: Indices of the pairs and single cameras whose motion it is, of one of several hypotheses and of a partial
+            motion.
     """
 
     reference_stamp_ns: int
@@ -166,6 +167,8 @@ class VisualResult:
         reason: Why it is not good, or empty.
         pairs: Pair index -> report of the pair.
         alternatives: Motion hypotheses with their own covariances, where pairs contradict each other.
+        partial_motion: Where too few points are in view for a motion, the predicted one as they correct it, if an IMU
+            predicts it; its covariance is of what they show, and large in directions that they do not show.
         own: At the end of a keyframe, pair index -> its own motion of body by the rig's extrinsics.
         is_stationary: Whether the images have shown no motion for a while.
         frozen: Pairs that were left out because a camera of theirs repeats an image.
@@ -180,6 +183,7 @@ class VisualResult:
     reason: str
     pairs: Mapping[int, PairReport]
     alternatives: tuple[RelativeMotion, ...] = ()
+    partial_motion: RelativeMotion | None = None
     own: Mapping[int, RelativeMotion] = field(default_factory=dict)
     is_stationary: bool = False
     frozen: frozenset[int] = frozenset()

@@ -128,12 +128,24 @@ class CalibrationInnovationCovariance:
         """
         pairs = frozenset(j for j, report in visual.pairs.items() if report.inliers)
         self._tested = None if visual.motion is None else _Measured(visual.motion, pairs)
-        if visual.motion is None or self._errors is None:
+        if self._errors is None:
             return visual
+        if visual.motion is None:
+            return replace(visual, partial_motion=self._noisier(visual.partial_motion, estimator))
         alternatives = tuple(self._motion_with_covariance(motion, pairs, estimator) for motion in visual.alternatives)
         return replace(
             visual, motion=self._motion_with_covariance(visual.motion, pairs, estimator), alternatives=alternatives
         )
+
+    def _noisier(self, motion: RelativeMotion | None, estimator: StateEstimator) -> RelativeMotion | None:
+        """Return a partial motion with that covariance as noise of its own: the state is not to follow its error."""
+        if motion is None:
+            return None
+        motion = self._motion_with_covariance(motion, frozenset(motion.pairs), estimator)
+        if motion.calibration_covariance is None:
+            return motion
+        noisy = motion.covariance + motion.calibration_covariance
+        return replace(motion, covariance=noisy, calibration_covariance=None)
 
     def _motion_with_covariance(
         self, motion: RelativeMotion, pairs: frozenset[int], estimator: StateEstimator
