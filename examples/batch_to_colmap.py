@@ -1,6 +1,6 @@
 """Optimise a recording as a whole, and open the result as a COLMAP model, as dense reconstruction takes it.
 
-    pip install 'graphvio[maps]'
+    pip install '.[maps]'          # in a clone of graphvio
     python batch_to_colmap.py RECORDING NEW_FOLDER
 
 graphvio is imported before pycolmap: in the other order the two libraries' allocators do not agree, and the process is
