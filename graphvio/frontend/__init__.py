@@ -19,8 +19,8 @@ its tracks alone.
 (`resection`) of every pair are scored on every pair (`cost`, `ransac`); the winner is refined and given its covariance
 (`refinement`, with the normal equations of `linearisation`, of points in `blocks` whose errors `point_errors` whitens,
 and the noise that `noise` estimates from the residuals). `selection` joins the pairs or decides between them;
-`depth_errors` has a motion's derivatives with respect to errors of the depths; `paper_method` has eq. (1) to (4) as the
-paper writes them.
+`few_points` corrects a predicted motion by points that are too few for that. `depth_errors` has a motion's derivatives
+with respect to errors of the depths; `paper_method` has eq. (1) to (4) as the paper writes them.
 
 *Decisions.* `agreement` finds consensus sets of pairs, `quality` grades a motion, `references` says when a keyframe
 ends. `extrinsics` has the poses of the cameras in body that are in force, and `extrinsic_monitor` tests the transfer

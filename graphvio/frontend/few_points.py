@@ -1,8 +1,8 @@
 """What few points show of a motion: too little to measure it, but enough to correct how it is predicted.
 
 Before a blank wall, a handful of points may be in view. They constrain the motion in some directions only, or with so
-little redundancy that nothing tells right points from wrong ones. An IMU predicts the motion over a frameset to a
-fraction of a pixel, though. Wrong points then stand out, and the errors of the others are linear in the error of the
+little redundancy that wrong points do not stand out. But an IMU predicts the motion since the last frameset to a
+fraction of a pixel. Wrong points then do stand out, and the errors of the others are linear in the error of the
 prediction: their normal equations are information about the motion, and the state estimator weighs it against the
 IMU's. It is what these points would contribute as landmarks of a tightly coupled estimator.
 """
@@ -102,7 +102,7 @@ def _whitened(
         by_place[:, [0, 1], [0, 1]] = (scale / depth)[:, None]
         by_place[:, :, 2] = -(scale / depth)[:, None] * projected
         rows = slice(2 * side, 2 * side + 2)
-        errors[:, rows] = scale[:, None] * (seen - projected)
+        errors[:, rows] = np.where(is_seen[:, None], scale[:, None] * (seen - projected), 0.0)
         turned = by_place @ rig.cam_T_body[pair, side, :3, :3]
         by_motion[:, rows, :3] = np.cross(in_body[:, None, :3], turned)
         by_motion[:, rows, 3:] = w[:, None, None] * turned

@@ -146,7 +146,9 @@ class VisualFrontend(TrackingFrontend):
         """
         observations = seen.correspondences.observations
         is_few = seen.reference and 0 < len(observations.pair) < self._config.motion.min_inliers
-        if not is_few or self._rig.imu is None or seen.frozen.all_since_ns is not None:
+        # Depths of single cameras have no scale of their own.
+        are_pairs = all(j < len(self._rig.pairs) for j in observations.pairs)
+        if not (is_few and are_pairs) or self._rig.imu is None or seen.frozen.all_since_ns is not None:
             return None
         if stereo_share(seen.reference, seen.frames, self._baselines_m).share < THRESHOLDS.quality.min_stereo_share:
             return None
