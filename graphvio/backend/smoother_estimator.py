@@ -40,6 +40,7 @@ from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion,
 from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
+_MAX_MOTIONS_OF_A_STANDSTILL = 20  # then a standstill that was assumed is believed
 _MIN_AGAINST_STANDSTILL = 3  # rejected motions, soon after an initialisation at a standstill
 _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
@@ -187,7 +188,8 @@ class SmootherEstimator:
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
         """Optimise the window and marginalise; one without a solution is rebuilt around the prediction."""
-        smoother, is_rebuilt, self._kept_ns = self._running, False, keep
+        smoother, is_rebuilt = self._running, False
+        self._kept_ns = keep
         if is_constrained:
             self._tracked_ns = stamp_ns
         try:
@@ -248,7 +250,11 @@ class SmootherEstimator:
     def use_inertial_state(self, known: InertialState) -> bool:
         """Go on with velocity, biases and gravity from a keyframe of the window that contradicts the state's.
 
-        They must be about as well known: their tilt by at most twice the standard deviation.
+        They must be about as well known: their tilt by at most twice the standard deviation. A state that agrees with
+        them stays as it is, since a new one ends the keyframe.
+
+        Returns:
+            Whether the state was replaced.
         """
         smoother, tilt = self._running, self.covariance.tilt
         if not self.has_imu or self._is_imu_left_out or self._refused or self._status.is_lost or tilt is None:
@@ -505,7 +511,7 @@ class SmootherEstimator:
     @property
     def _may_be_moving(self) -> bool:
         """Whether a standstill was assumed a moment ago, and images may show that it was none."""
-        return self._is_standstill_assumed and self._accepted < _MIN_TRUSTED_MOTIONS
+        return self._is_standstill_assumed and self._accepted < _MAX_MOTIONS_OF_A_STANDSTILL
 
     @property
     def _running(self) -> Smoother:

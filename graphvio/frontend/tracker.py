@@ -79,7 +79,7 @@ class GroupTracker:
         self._right_pyramid: Pyramid = ()
         self._patches = KeyframePatches(group, config.tracking.window_px)
         self._noise = NoiseFilter()
-        self._motion: ReadoutMotion | None = None
+        self._readout: ReadoutMotion | None = None
         self._left_T_left_keyframe: Float | None = None
 
     def observe(
@@ -90,7 +90,7 @@ class GroupTracker:
         left_T_left_prev: Float | None,
         left_T_left_keyframe: Float | None,
         masks: tuple[Image | None, ...] = (None, None),
-        motion: ReadoutMotion | None = None,
+        readout: ReadoutMotion | None = None,
     ) -> TrackedFrame:
         """Follow the tracks, match them left to right and triangulate; replenish them where few are left.
 
@@ -101,7 +101,7 @@ class GroupTracker:
             left_T_left_prev: (4, 4) predicted motion of points since the previous images, or None if unknown.
             left_T_left_keyframe: (4, 4) the same since the keyframe of `keep_keyframe_patches`, or None.
             masks: of each image, (height, width), whose zeros are not used, or None.
-            motion: of body while rolling shutters read the images out, or None if unknown.
+            readout: motion of body while rolling shutters read the images out, or None if unknown.
         """
         watch = Stopwatch()
         self._left_T_left_keyframe = left_T_left_keyframe
@@ -112,7 +112,7 @@ class GroupTracker:
         self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:
             self._matcher.allow(self._usable[1].of(right, masks[1]))
-        self._motion = motion if any(camera.line_time_us for camera in self._group.cameras) else None
+        self._readout = readout if any(camera.line_time_us for camera in self._group.cameras) else None
         watch.lap("pyramid")
         last, guess, inverse_depths, is_in_view = self._predict(left_T_left_prev)
         pixels, found = self._follow(before, last, guess, is_in_view, left_T_left_prev, left_T_left_keyframe, watch)
@@ -224,14 +224,14 @@ class GroupTracker:
         """
         last, camera = self._last.keep(self._last.frames_without_depth <= _MAX_FRAMES_WITHOUT_DEPTH), self._group.left
         if left_T_left_prev is None:
-            depths = np.where(last.has_depth, last.points[:, 2], np.nan)
-            return last, last.pixels, depths, np.ones(len(last.ids), dtype=bool)
+            inverse_depths = np.where(last.has_depth, last.points[:, 2], np.nan)
+            return last, last.pixels, inverse_depths, np.ones(len(last.ids), dtype=bool)
         w = _inverse_depths(last)
         pixels, inverse_depths, valid = predict_pixels(
             last.left_rays, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
         )
-        if self._motion is not None:
-            pixels, inverse_depths = pixels_at_lines(camera, pixels, inverse_depths, self._motion)
+        if self._readout is not None:
+            pixels, inverse_depths = pixels_at_lines(camera, pixels, inverse_depths, self._readout)
         valid &= camera.contains(pixels)
         inverse_depths[~(last.has_depth & valid)] = np.nan
         return last, np.where(valid[:, None], pixels, last.pixels), inverse_depths, valid
@@ -266,6 +266,7 @@ class GroupTracker:
             pixels, found = self._follow_again(before, last, pixels, found)
         watch.lap("flow")
         if left_T_left_keyframe is not None:
+            # Followed from frame to frame they would drift off their points: they are registered like the others.
             others = others[found[others]]
             pixels[others], _ = self._patches.find(
                 last.ids[others], pixels[others], self._left_pyramid[0], left_T_left_keyframe, self._min_gradient
@@ -336,7 +337,7 @@ class GroupTracker:
         rays, has_ray = self._group.left.unproject(pixels)
         if self._matcher is None:
             frame = _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
-            return frame if self._motion is None else as_at_stamp(frame, self._group, self._motion)
+            return frame if self._readout is None else as_at_stamp(frame, self._group, self._readout)
         matches = self._matcher.match(
             self._left_pyramid, self._right_pyramid, pixels, rays, inverse_depths, slopes, self._min_gradient
         )
@@ -356,7 +357,7 @@ class GroupTracker:
             frames_without_depth=np.where(has_depth, 0, frames_without_depth + 1),
             rejected=rejected | matches.rejected,
         ).keep(has_ray)
-        return frame if self._motion is None else as_at_stamp(frame, self._group, self._motion)
+        return frame if self._readout is None else as_at_stamp(frame, self._group, self._readout)
 
     @property
     def _min_gradient(self) -> float:
@@ -396,7 +397,7 @@ def _unmatched(
 ) -> TrackedFrame:
     """Return the tracks of a single camera, with the inverse depths (N,) that are expected where they are known."""
     n = len(ids)
-    depths = np.where(np.isfinite(inverse_depths), inverse_depths, PRIOR_INVERSE_DEPTH)
+    filled = np.where(np.isfinite(inverse_depths), inverse_depths, PRIOR_INVERSE_DEPTH)
     nothing, unmoved = np.zeros((n, 2)), np.zeros(n, dtype=np.int64)
     return TrackedFrame(
         stamp_ns=stamp_ns,
@@ -406,7 +407,7 @@ def _unmatched(
         left_rays=rays,
         right_rays=nothing,
         right_pixels=nothing,
-        points=np.column_stack([rays, depths]),
+        points=np.column_stack([rays, filled]),
         covariances=np.tile(np.eye(3), (n, 1, 1)),
         slopes=nothing,
         has_depth=np.ones(n, dtype=bool),

@@ -234,7 +234,7 @@ class MonocularEstimator:
             return self._initialising(stamp_ns, is_keyframe)
         try:
             update = self._solve(self._window, stamp_ns, is_keyframe)
-            instead = self._without_overlaps(stamp_ns, self._window) if is_keyframe and self._window else None
+            instead = self._drop_wrong_overlaps(stamp_ns, self._window) if is_keyframe and self._window else None
             if instead is None:
                 return update
             self._lose(stamp_ns, "overlapping views contradict the IMU")
@@ -247,7 +247,7 @@ class MonocularEstimator:
         """Collect keyframes, and begin the window once the scale is known."""
         if self._has_imu and not self._is_imu_doubted and (is_keyframe or self._is_stationary):
             window = self._initialiser.add(stamp_ns, self._camera_tracks, self._is_stationary)
-            instead = self._without_overlaps(stamp_ns, window)
+            instead = self._drop_wrong_overlaps(stamp_ns, window)
             if instead is not None:
                 return self._begin(instead, stamp_ns, is_keyframe)
             if window is not None:
@@ -279,8 +279,8 @@ class MonocularEstimator:
         )
         return self._solve(window, stamp_ns, is_keyframe, is_new=True)
 
-    def _without_overlaps(self, stamp_ns: int, window: KeyframeWindow | None) -> KeyframeWindow | None:
-        """Return a window without overlaps where these cannot be trusted: they are not used from then on.
+    def _drop_wrong_overlaps(self, stamp_ns: int, window: KeyframeWindow | None) -> KeyframeWindow | None:
+        """Stop using overlaps once they prove wrong, and return a window without them; None while they are right.
 
         Once the calibration is estimated, the window itself finds out how the cameras are turned to each other.
         """
@@ -303,10 +303,10 @@ class MonocularEstimator:
             window.add_views(self._camera_tracks, self._is_stationary)
         self._is_keyframe = is_keyframe
         solution = self._solver.solve(window, stamp_ns, is_keyframe)
-        return StateUpdate(self._status(stamp_ns, solution), outliers=solution.dropped)
+        return StateUpdate(self._judge(stamp_ns, solution), outliers=solution.dropped)
 
-    def _status(self, stamp_ns: int, solution: Solution) -> Status:
-        """Return the status; images and IMU that contradict each other for long end the epoch."""
+    def _judge(self, stamp_ns: int, solution: Solution) -> Status:
+        """Return the status by a solution; end the epoch where images and IMU contradict each other for long."""
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(self.covariance.pose[3:, 3:])[-1]))
         errors2 = solution.imu_errors2
         contradicts = bool(len(errors2) and not errors2[-1] < _MAX_IMU_ERROR2)
@@ -341,7 +341,7 @@ class MonocularEstimator:
                 self._calibration.keep()
             self.epoch += 1
             self._report(stamp_ns, EventKind.LOST, why)
-        self._window, self._before, self._contradicted_since_ns, self._standstill = None, None, None, None
+        self._window = self._before = self._contradicted_since_ns = self._standstill = None
         self._solver.forget()
         self._collect_keyframes()
         self._since_ns, self._is_reported = stamp_ns, False

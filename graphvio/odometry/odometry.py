@@ -449,7 +449,8 @@ class Odometry:
         estimate = with_state(measured, estimator, self._calibration, self._nav)
         to_stamp = self._clocks.motion_to_stamp(frameset.stamp_ns, estimator.state(), estimator.latest_rate())
         estimate = estimate if to_stamp is None else at_stamp(estimate, to_stamp)
-        references, keyframe = self._frontend.reference_stamps_ns, None
+        references = self._frontend.reference_stamps_ns
+        keyframe = None
         if frameset.stamp_ns in references:
             keyframe = keyframe_of(frameset, self._frontend, estimator, self._nav, self._keyframe_ns)
             self._keyframe_ns = frameset.stamp_ns

@@ -1,4 +1,4 @@
-"""Calibration of a rig as one vector of parameters: its layout, its prior, and rigs that differ by such a vector.
+"""Calibration of a rig as one vector of parameters: its layout, and rigs that differ by such a vector.
 
 Of a lens, the first five coefficients have a place in it; the others, of ``rational``'s denominator, are kept.
 
