@@ -13,6 +13,7 @@ from graphvio.evaluation import evaluate
 from graphvio.measurements.estimate import Estimate
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import NewKeyframe
+from graphvio.optimization.record import Recorder
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
@@ -83,3 +84,18 @@ def test_walk_that_begins_before_the_blank_bend_by_a_wrong_rig_file_goes_on_thro
     assert source.truth is not None
     assert evaluate(trajectory, load_trajectory(source.truth)).ate_position_m.rmse < 0.2
     assert [keyframe.previous_T_body is None for keyframe in keyframes] == [True] + [False] * (len(keyframes) - 1)
+
+
+def test_few_points_before_the_bend_are_measurements_of_the_session(corridor: Path) -> None:
+    source, recorder = open_source(corridor), Recorder("corridor")
+    blank_s, textured_s = build_scene("corridor", DURATION_S).events["blank"]
+    odometry = Odometry(source.rig, Config())
+    odometry.subscribe(recorder.add)
+    for measurement in source:
+        if blank_s - 2.0 <= 1e-9 * (measurement.stamp_ns - source.start_ns) <= textured_s + 1.0:
+            odometry.process(measurement)
+    odometry.finish()
+    record = recorder.record()
+    few = record.motions.inliers < Config().motion.min_inliers
+    assert few.sum() >= 2
+    assert not set(record.motions.row[few]) & set(record.motions.row[~few])

@@ -26,11 +26,13 @@ class MeasurementUpdate:
     Attributes:
         motion: The relative motion that constrains the newest state, or None where there is none or it was
             rejected by the gate.
+        partial_motion: What few points show of the motion, if it was used; it does not constrain the state by itself.
         needs_keyframe: Whether later motions have to be measured from the newest frameset, because no state is kept
             that they could be measured from otherwise.
     """
 
     motion: RelativeMotion | None
+    partial_motion: RelativeMotion | None = None
     needs_keyframe: bool = False
 
 

@@ -315,8 +315,7 @@ class SmootherEstimator:
         """Insert the motion if it passes the gate; reinitialise after lost, or once it was refused for too long."""
         smoother, motion = self._running, visual.motion
         if motion is None:
-            self._apply_partial_motion(visual.partial_motion)
-            return MeasurementUpdate(None)
+            return self._apply_partial_motion(visual.partial_motion)
         if not smoother.knows(motion.reference_stamp_ns):  # the state was reinitialised since then
             return MeasurementUpdate(None, needs_keyframe=True)
         if self._status.is_lost and (motion.reference_stamp_ns > self._tracked_ns or self._rebuilt_sigma_m):
@@ -337,15 +336,17 @@ class SmootherEstimator:
             return MeasurementUpdate(None)
         return self._refuse(motion)
 
-    def _apply_partial_motion(self, motion: RelativeMotion | None) -> None:
+    def _apply_partial_motion(self, motion: RelativeMotion | None) -> MeasurementUpdate:
         """Let few points correct the state that the IMU predicts, if they pass the gate; vision fails all the same."""
         is_predicted = self.has_imu and not (self._is_imu_left_out or self._refused or self._status.is_lost)
         if motion is None or not is_predicted or not self._running.knows(motion.reference_stamp_ns):
-            return
+            return MeasurementUpdate(None)
         # Few points may all be on somebody who walks by. The IMU shows it the sooner, the stricter the test.
         self._are_points_wrong |= self._running.gate(motion).statistic > _MAX_PARTIAL_STATISTIC
-        if not self._are_points_wrong:
-            self._running.add_partial_motion(motion)
+        if self._are_points_wrong:
+            return MeasurementUpdate(None)
+        self._running.add_partial_motion(motion)
+        return MeasurementUpdate(None, partial_motion=motion)
 
     def _accept(self, motion: RelativeMotion) -> MeasurementUpdate:
         """Insert a motion that passes the gate; reinitialise if it begins at a state whose own motion was refused."""

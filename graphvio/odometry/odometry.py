@@ -464,6 +464,7 @@ class Odometry:
             references=references,
             own={} if applied.motion is None else visual.own,
             keyframe=keyframe,
+            partial_motion=applied.partial_motion,
         )
         for on_step in self._on_step:
             on_step(step)

@@ -48,6 +48,7 @@ class Step:
         references: Stamps of the framesets that later motions are measured from.
         own: Pair index -> its own motion, at the end of a keyframe whose motion is used.
         keyframe: The frameset's data if later motions are measured from it, or None.
+        partial_motion: Where there is no motion, what few points show of it, if it was used; otherwise None.
     """
 
     estimate: Estimate
@@ -58,3 +59,4 @@ class Step:
     references: frozenset[int]
     own: Mapping[int, RelativeMotion]
     keyframe: NewKeyframe | None
+    partial_motion: RelativeMotion | None = None

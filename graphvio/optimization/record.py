@@ -153,6 +153,8 @@ class Recorder:
         if motion is not None and step.used:
             self._motions.append(motion)
             self._own += sorted(step.own.items())
+        if step.partial_motion is not None:
+            self._motions.append(step.partial_motion)
         intervals = self._since
         self._steps.append(
             _Row(
