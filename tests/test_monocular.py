@@ -41,7 +41,14 @@ from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import States
-from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Eliminated, Structure, landmarks_after, located
+from graphvio.monocular.structure import (
+    PRIOR_INFORMATION,
+    PRIOR_INVERSE_DEPTH,
+    Eliminated,
+    Structure,
+    landmarks_after,
+    located,
+)
 from graphvio.monocular.window import MAX_ERROR2
 from graphvio.monocular.window_prior import Prior, add_prior, first_prior
 from graphvio.rig import Camera, Rig, SingleCamera
@@ -386,7 +393,7 @@ def problem(
     landmark_ids = LandmarkIds(len(rig.singles), n_keyframes)
     views = [landmark_ids.join(tracks.camera_tracks(t, 0.3)) for t in times]
     structure, places, _ = landmarks.structure(views, states.poses, cameras)
-    places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
+    places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, True)
     measured = Measurements(cameras, structure, PIXEL_SIGMA_PX, samples, np.zeros(0, dtype=np.int64))
     return Problem(measured, states, places, prior)
 
@@ -401,9 +408,11 @@ def at_best(measured: Measurements, states: States, landmarks: Float) -> tuple[F
     """Return Hessian, gradient and cost of poses and cameras, with the landmarks at their best places."""
     cameras = states.cameras(measured.cameras)
     for _ in range(20):
-        landmarks = located(states.poses, cameras, landmarks, measured.structure, 2.0, True)
+        landmarks = located(states.poses, cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, True)
     eliminated = Eliminated.empty(measured.structure, states.n_camera_parameters)
-    return visual_equations(states.poses, cameras, landmarks, measured.structure, 2.0, 1e4, eliminated)[:3]
+    return visual_equations(
+        states.poses, cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, 1e4, eliminated
+    )[:3]
 
 
 def moved_by(states: States, unknown: int, step: float) -> States:
@@ -477,7 +486,14 @@ def test_a_lens_that_is_wrong_by_the_file_moves_rays_as_its_derivatives_say(mode
         )
         landmark = np.array([[expected[0], expected[1], 0.2]])
         errors2 = visual_equations(
-            np.eye(4)[None], Cameras.of(rig).moved(change), landmark, structure, 1.0, 1e4, Eliminated.empty(structure)
+            np.eye(4)[None],
+            Cameras.of(rig).moved(change),
+            landmark,
+            structure,
+            1.0,
+            0.0,
+            1e4,
+            Eliminated.empty(structure),
         )[3]
         off_px = camera.focal_px * float(np.linalg.norm(expected - seen))
         assert off_px > 0.1
@@ -587,9 +603,13 @@ def test_landmarks_that_were_held_move_along_with_the_keyframes_to_where_they_ar
     def error2(frames: Float, places: Float, at_best: bool) -> float:
         structure = measured.structure._replace(odom_T_landmark=frames)
         for _ in range(10 if at_best else 0):
-            places = located(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
+            places = located(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, True)
         none = Eliminated.empty(structure)
-        return float(visual_equations(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, 1e4, none)[3].sum())
+        return float(
+            visual_equations(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, 1e4, none)[
+                3
+            ].sum()
+        )
 
     frames, places = held.moved_along(changed)
     stays = error2(measured.structure.odom_T_landmark, landmarks, False)
@@ -822,7 +842,9 @@ def in_odom(frames: Float, landmarks: Float) -> Float:
 
 def visual_cost(measured: Measurements, states: States, landmarks: Float, eliminated: Eliminated) -> float:
     return float(
-        visual_equations(states.poses, measured.cameras, landmarks, measured.structure, 2.0, 1e4, eliminated)[2]
+        visual_equations(
+            states.poses, measured.cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, 1e4, eliminated
+        )[2]
     )
 
 

@@ -19,7 +19,7 @@ from graphvio.monocular.states import (
     inertial_columns,
     visual_columns,
 )
-from graphvio.monocular.structure import Eliminated, Structure, landmarks_after, located
+from graphvio.monocular.structure import PRIOR_INFORMATION, Eliminated, Structure, landmarks_after, located
 from graphvio.monocular.window_prior import Prior, add_prior
 from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
@@ -40,6 +40,7 @@ class Measurements(NamedTuple):
         sigma_px: noise of a corner's position.
         samples: of the IMU, whose keyframes are the states.
         stationary: (K,) of states, which do not move.
+        depth_information: of a landmark's prior inverse depth, m^2.
     """
 
     cameras: Cameras
@@ -47,6 +48,7 @@ class Measurements(NamedTuple):
     sigma_px: float
     samples: InertialSamples
     stationary: Int
+    depth_information: float = PRIOR_INFORMATION
 
 
 class Equations(NamedTuple):
@@ -94,7 +96,7 @@ def equations(
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, cost, errors2 = visual_equations(
         states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
-        ROBUST_SCALE, eliminated,
+        measured.depth_information, ROBUST_SCALE, eliminated,
     )  # fmt: skip
     inertial = inertial_equations(
         measured.samples, InertialStates(states.poses, states.velocities, states.gravity, states.parameters)
@@ -153,7 +155,9 @@ def adjust(
         numpy.linalg.LinAlgError: if the equations have no solution.
     """
     cameras, n = states.cameras(measured.cameras), len(states.poses)
-    landmarks = located(states.poses, cameras, landmarks, measured.structure, measured.sigma_px, False)
+    landmarks = located(
+        states.poses, cameras, landmarks, measured.structure, measured.sigma_px, measured.depth_information, False
+    )
     at = equations(measured, states, landmarks, prior, file)
     damping = _DAMPING
     for _ in range(max_steps):
@@ -216,9 +220,16 @@ def views_only(
     Returns:
         Information (6 K, 6 K) and gradient (6 K,).
     """
-    landmarks = located(states.poses, cameras, landmarks, structure, sigma_px, True)
+    landmarks = located(states.poses, cameras, landmarks, structure, sigma_px, PRIOR_INFORMATION, True)
     information, gradient, _, _ = visual_equations(
-        states.poses, cameras, landmarks, structure, sigma_px, ROBUST_SCALE, Eliminated.empty(structure)
+        states.poses,
+        cameras,
+        landmarks,
+        structure,
+        sigma_px,
+        PRIOR_INFORMATION,
+        ROBUST_SCALE,
+        Eliminated.empty(structure),
     )
     return information, gradient
 

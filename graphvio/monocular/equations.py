@@ -69,8 +69,8 @@ def _new_sums(n_poses: int, n_cameras: int, n_calibration: int) -> _Sums:
 
 @vector_kernel
 def visual_equations(
-    poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, scale: float,
-    eliminated: Eliminated,
+    poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, depth_information: float,
+    scale: float, eliminated: Eliminated,
 ) -> tuple[Float, Float, float, Float]:  # fmt: skip
     """Linearise the reprojection errors, with the landmarks eliminated.
 
@@ -80,6 +80,7 @@ def visual_equations(
         landmarks: (L, 3).
         structure: of these.
         sigma_px: noise of a corner's position.
+        depth_information: of an inverse depth, that it is `PRIOR_INVERSE_DEPTH`.
         scale: of the Cauchy cost, in whitened units.
         eliminated: output; its size says whether the cameras' calibration is unknown, too.
 
@@ -102,8 +103,8 @@ def visual_equations(
             continue
         begin, end = POSE * structure.state[first], POSE * (structure.state[last - 1] + 1)
         away = landmarks[point, 2] - PRIOR_INVERSE_DEPTH
-        cost += 0.5 * PRIOR_INFORMATION * away * away
-        _begin_landmark(sums, begin, end, of_one, away)
+        cost += 0.5 * depth_information * away * away
+        _begin_landmark(sums, begin, end, of_one, depth_information, away)
         is_possible = abs(landmarks[point, 2]) <= _MAX_INVERSE_DEPTH  # else it goes back to its prior
         for n in range(first, last):
             k, j = structure.state[n], structure.camera[n]
@@ -131,7 +132,7 @@ def visual_equations(
 
 
 @vector_kernel
-def _begin_landmark(sums: _Sums, begin: int, end: int, of_one: int, away: float) -> None:
+def _begin_landmark(sums: _Sums, begin: int, end: int, of_one: int, information: float, away: float) -> None:
     """Begin the sums of a landmark with its prior, which its inverse depth is away from; it is seen in some columns."""
     normal, gradient = sums.normal, sums.gradient
     for r in range(3):
@@ -140,8 +141,8 @@ def _begin_landmark(sums: _Sums, begin: int, end: int, of_one: int, away: float)
             normal[r, c] = 0.0
         for c in range(begin, end):
             sums.coupled[r, c] = 0.0
-    normal[0, 0], normal[1, 1], normal[2, 2] = 1e-9, 1e-9, PRIOR_INFORMATION
-    gradient[2] = PRIOR_INFORMATION * away
+    normal[0, 0], normal[1, 1], normal[2, 2] = 1e-9, 1e-9, information
+    gradient[2] = information * away
     for j in range(len(sums.seen)):
         sums.seen[j] = False
         for r in range(3):

@@ -26,7 +26,7 @@ from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS
 from graphvio.monocular.sightings import LandmarkIds, Landmarks, Views, far_off
 from graphvio.monocular.states import States, size_m
-from graphvio.monocular.structure import located
+from graphvio.monocular.structure import PRIOR_INFORMATION, located
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
 from graphvio.monocular.window_prior import Prior, first_prior
 from graphvio.self_calibration.evidence import Gaussian
@@ -161,7 +161,7 @@ class Initialiser:
                 self.reason = f"only {len(ids)} points stand still"
                 self._fits_no_motion = True
                 return None
-            places = located(states.poses, cameras, places, structure, self._sigma_px, True)
+            places = located(states.poses, cameras, places, structure, self._sigma_px, PRIOR_INFORMATION, True)
             measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
             if file is not None and is_first:
                 measured, states, places = self._roughly_adjusted(measured, states, places, prior, file)

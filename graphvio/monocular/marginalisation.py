@@ -102,7 +102,7 @@ def _linearised(
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, _, _ = visual_equations(
         states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
-        ROBUST_SCALE, eliminated,
+        measured.depth_information, ROBUST_SCALE, eliminated,
     )  # fmt: skip
     size = 9 * n + GRAVITY + BIASES + len(states.calibration)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)

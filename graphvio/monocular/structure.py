@@ -118,8 +118,9 @@ def landmarks_after(
 
 @kernel
 def located(
-    poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, everywhere: bool
-) -> Float:
+    poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, depth_information: float,
+    everywhere: bool,
+) -> Float:  # fmt: skip
     """Return the landmarks (L, 3) with those of few views, or all, located again for poses that stay."""
     moved, rows = landmarks.copy(), np.zeros((2, COLUMNS))
     v, inverse, bl = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
@@ -130,9 +131,9 @@ def located(
             continue
         for _ in range(_STEPS):
             for c in range(3):
-                bl[c] = PRIOR_INFORMATION * (moved[point, 2] - PRIOR_INVERSE_DEPTH) if c == 2 else 0.0
+                bl[c] = depth_information * (moved[point, 2] - PRIOR_INVERSE_DEPTH) if c == 2 else 0.0
                 for d in range(3):
-                    v[c, d] = PRIOR_INFORMATION if c == 2 and d == 2 else 0.0
+                    v[c, d] = depth_information if c == 2 and d == 2 else 0.0
             for n in range(first, last):
                 j = structure.camera[n]
                 if not whiten_view(

@@ -11,7 +11,7 @@ from graphvio.monocular.adjustment import Measurements, adjust, covariance_of
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.states import States
-from graphvio.monocular.structure import Structure, located
+from graphvio.monocular.structure import PRIOR_INFORMATION, Structure, located
 from graphvio.monocular.window_prior import first_prior
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_model import PARAMETERS
@@ -36,7 +36,7 @@ def warm_up_keyframe_window(rig: Rig) -> None:
     structure = Structure(
         np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros(2, dtype=np.int64), np.zeros((2, 2))
     )
-    places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
+    places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, PRIOR_INFORMATION, True)
     measured = Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64))
     adjust(measured, states, places, prior, max_steps=1, converged=0.0)
     cameras.moved(np.zeros(SINGLE * len(rig.singles)))
