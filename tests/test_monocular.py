@@ -39,6 +39,7 @@ from graphvio.monocular.held_landmarks import HeldLandmarks
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.reversal import adjust_forwards, is_reversed
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import States
 from graphvio.monocular.structure import (
@@ -1071,6 +1072,31 @@ def test_estimator_without_points_coasts_and_goes_on() -> None:
     assert flown.statuses[-1] is Status.TRACKING
     assert flown.estimator.epoch == 0
     assert aligned(flown)[0] < 0.05
+
+
+# ------------------------------------------------------------------ the reverse motion
+
+
+@pytest.mark.parametrize(
+    ("n_keyframes", "share", "off_m_s"),
+    [(2, -1.5, 0.3), (2, -1.0, 0.3), (2, -0.6, 0.3), (3, -0.3, 0.1), (4, -0.3, 0.1)],
+)
+def test_adjust_forwards_finds_the_motion_whose_reverse_was_found(
+    n_keyframes: int, share: float, off_m_s: float
+) -> None:
+    """Of two keyframes both fit the views equally; only the landmarks are behind."""
+    measured, true, landmarks, prior = problem(n_keyframes, is_exact=True)
+    poses = true.poses.copy()
+    poses[:, :3, 3] = poses[0, :3, 3] + share * (poses[:, :3, 3] - poses[0, :3, 3])
+    states = replace(true, poses=poses, velocities=share * true.velocities)
+    landmarks = np.column_stack([landmarks[:, :2], np.full(len(landmarks), PRIOR_INVERSE_DEPTH)])
+    is_seen = np.ones(len(landmarks), dtype=bool)
+    found = adjust(measured, states, landmarks, prior, 10)
+    assert is_reversed(found, is_seen)
+    forwards = adjust_forwards(measured, states, landmarks, prior, None, 1e-3)
+    assert not is_reversed(forwards, is_seen)
+    assert forwards.equations.cost < found.equations.cost + 0.1
+    assert np.linalg.norm(forwards.states.velocities - true.velocities, axis=1).max() < off_m_s
 
 
 # ------------------------------------------------------------------ rigs and commands

@@ -9,8 +9,8 @@ and depths, `adjustment` solves, and `overlap_trust` asks whether overlapping vi
 *The window.* `window` holds the states (`states`), what was seen from them (`sightings`) and the IMU in between
 (`sample_buffer`). `window_solver` solves it at a frameset: `equations` are its normal equations, with the landmarks
 eliminated (`structure`, with the errors of `reprojection`); between keyframes, landmarks are held as they were
-linearised (`held_landmarks`). `marginalisation` turns the oldest state into a prior (`window_prior`). `points` locates
-what the newest state sees.
+linearised (`held_landmarks`). `reversal` recognises the reverse of the motion. `marginalisation` turns the oldest state
+into a prior (`window_prior`). `points` locates what the newest state sees.
 
 *The calibration.* `calibration` has lenses, places and the IMU's errors as unknowns of the window.
 """

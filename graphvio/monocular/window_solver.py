@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Float, Int
 from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
 from graphvio.measurements.motion import LocatedPoints
 from graphvio.measurements.window_views import FirstWindow, WindowViews
@@ -20,21 +20,18 @@ from graphvio.monocular.held_landmarks import HeldLandmarks
 from graphvio.monocular.marginalisation import first_window, with_landmarks, without_first
 from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.reversal import adjust_forwards, is_reversed
 from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import far_off
 from graphvio.monocular.states import States
-from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Structure
+from graphvio.monocular.structure import Structure
 from graphvio.monocular.window import MAX_ERROR2, MAX_KEYFRAMES, MAX_OFF, KeyframeWindow
-from graphvio.monocular.window_prior import Prior
 from graphvio.self_calibration.pixel_noise import pixel_noise
 
 FIRST_MONOCULAR_SIGMA_PX = 0.3
 _MAX_SIGMA_PX = 0.6
 _NOISE_GAIN = 0.1  # of one keyframe
-_STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS, _REVERSAL_STEPS = 2, 3, 10, 10
-_MIN_REVERSED = 5  # landmarks in view
-_REVERSED = -0.03  # 1/m, a median inverse depth that is not the noise of far landmarks
-_INFORMATION_IN_FRONT = 100.0  # of an inverse depth, known to 0.1 / m
+_STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
 _CONVERGED = 0.1  # squared distance from the solution, in standard deviations; the next frameset goes on from there
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
@@ -167,21 +164,13 @@ class WindowSolver:
             structure, places, ids = structure.of(others), places[others], ids[others]
         measured = self._measured(window, structure)
         adjusted = adjust(measured, window.states, places, prior, max_steps, self.calibration.file(), _CONVERGED)
-        if _is_reversed(adjusted, np.isin(ids, window.views[-1].landmark)):
-            adjusted = self._turned_round(window, measured, places, prior)
+        is_seen = np.isin(ids, window.views[-1].landmark)
+        if is_reversed(adjusted, is_seen):
+            forwards = adjust_forwards(measured, window.states, places, prior, self.calibration.file(), _CONVERGED)
+            if not is_reversed(forwards, is_seen):
+                adjusted = forwards
         _put(adjusted, window, ids)
         return adjusted, ids
-
-    def _turned_round(
-        self, window: KeyframeWindow, measured: Measurements, places: Float, prior: Prior | None
-    ) -> Adjusted:
-        """Adjust a window again from before, first with landmarks that are held in front of their cameras."""
-        file = self.calibration.file()
-        places = np.column_stack([places[:, :2], np.where(places[:, 2] < 0.0, PRIOR_INVERSE_DEPTH, places[:, 2])])
-        held = measured._replace(depth_information=_INFORMATION_IN_FRONT)
-        first = adjust(held, window.states, places, prior, _REVERSAL_STEPS, file, _CONVERGED)
-        free = first.measured._replace(depth_information=measured.depth_information)
-        return adjust(free, first.states, first.landmarks, prior, _REVERSAL_STEPS, file, _CONVERGED)
 
     def _structure(self, window: KeyframeWindow) -> tuple[Structure, Float, Int]:
         """Return the window's landmarks, where they are (L, 3), and their identities (L,)."""
@@ -261,16 +250,6 @@ class WindowSolver:
         self._on_views(
             WindowViews(states.stamps_ns[kept], states.poses[kept], information[np.ix_(rows, rows)], gradient[rows])
         )
-
-
-def _is_reversed(adjusted: Adjusted, is_seen: Bool) -> bool:
-    """Return whether most of the landmarks in view (L,) are behind the cameras that see them.
-
-    Views alone cannot distinguish a motion from its reverse, with all landmarks behind: both cause the same flow. Where
-    the velocity is uncertain by more than its size, as after a long gap, a window may find the reverse.
-    """
-    inverse_depths = adjusted.landmarks[is_seen, 2]
-    return len(inverse_depths) >= _MIN_REVERSED and bool(np.median(inverse_depths) < _REVERSED)
 
 
 def _put(adjusted: Adjusted, window: KeyframeWindow, ids: Int) -> None:
