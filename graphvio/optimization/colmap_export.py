@@ -18,7 +18,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.errors import OptimizationError
+from graphvio.errors import OptimizationError, writing
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.covisibility import verify_matches
 from graphvio.optimization.loops.closures import Place
@@ -79,7 +79,7 @@ def export(
         raise OptimizationError(
             f"{database.path}: holds no image of the sessions' places; extract their features first"
         )
-    try:
+    with writing(folder, OptimizationError, "is the disk full?"):
         _write_images(sessions, database, folder / "images", partial(on_progress, "images"))
         verify_matches(optimization, sessions, database, partial(on_progress, "matches"))
         for old in (folder / "sparse").glob("*"):
@@ -92,8 +92,6 @@ def export(
             model = _triangulated(_posed(optimization, sessions, places, database), database, folder, target, config)
             models.append(_described(model, target, frame))
             on_progress("models", number + 1, len(groups))
-    except OSError as error:
-        raise OptimizationError(f"{folder}: cannot be written ({error}); is the disk full?") from None
     return models
 
 

@@ -7,16 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from graphvio.errors import MissingExtraError, SessionError
+from graphvio.errors import SessionError, importing
 from graphvio.sessions import cdr, ros1
 from graphvio.sessions.messages import STAMPED
 from graphvio.sessions.topics import Place, Store, Topic
 
-try:
+with importing("rosbags", "sessions", "reading a bag"):
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
-except ImportError:
-    raise MissingExtraError("rosbags", "sessions", "reading a bag") from None
 
 
 class BagFile(Store):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from graphvio.errors import MissingExtraError, SourceError
+from graphvio.errors import SourceError, importing
 from graphvio.live.device_clock import MicrosecondCounter
 from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.measurements.events import EventKind
@@ -114,10 +114,8 @@ class SerialImu:
     """
 
     def __init__(self, path: str, baud: int) -> None:
-        try:
+        with importing("pyserial", "live", "an IMU on a serial port"):
             import serial
-        except ImportError:
-            raise MissingExtraError("pyserial", "live", "an IMU on a serial port") from None
         self._library = serial
         self.name = f"serial:{path}"
         self.clock = self.name
