@@ -30,7 +30,7 @@ class _FirstMessages:
         self._data: list[bytes] = []
 
     def add(self, topic: str, type_name: str, data: bytes) -> None:
-        self.topics.setdefault(topic, Topic(topic, type_name, "cdr")).places.append(Place(-1, len(self._data)))
+        self.topics.setdefault(topic, Topic(topic, type_name)).places.append(Place(-1, len(self._data)))
         self._data.append(data)
 
     def read(self, place: Place) -> bytes:

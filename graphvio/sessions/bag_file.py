@@ -63,7 +63,7 @@ class BagFile(Store):
         numbers = {id(each): number for number, each in enumerate(self._connections)}
         rows = [0] * len(self._connections)
         for each in self._connections:
-            self.topics.setdefault(each.topic, Topic(each.topic, each.msgtype, "cdr"))
+            self.topics.setdefault(each.topic, Topic(each.topic, each.msgtype))
         if not self._connections:
             return
         for connection, logged_ns, data in self._reader.messages(self._connections):

@@ -133,7 +133,7 @@ class McapFile(Store):
             self._schemas[record.id] = record.name
         elif isinstance(record, Channel):
             type_name = self._schemas.get(record.schema_id, "")
-            topic = Topic(record.topic, type_name, record.message_encoding)
+            topic = Topic(record.topic, type_name)
             self._channels[record.id] = self.topics.setdefault(record.topic, topic)
         elif isinstance(record, Attachment):
             self.attachments[record.name] = record.data

@@ -29,8 +29,8 @@ VERSION = 1
 _MAX_MAPS = 6
 
 
-def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory | None]) -> Path:
-    """Write all numbers as JSON, and the page with its figures, whose path is returned; each file is whole or absent.
+def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory | None]) -> None:
+    """Write all numbers as JSON, and the page with its figures; each file is whole or absent.
 
     Args:
         found: the optimisation.
@@ -52,11 +52,10 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
         folder.mkdir(parents=True, exist_ok=True)
         replace_file(folder / SUMMARY, summary)
         replace_file(folder / PAGE, page(found, numbers, maps, pictures))
-    return folder / PAGE
 
 
-def write_plan(found: Optimization, folder: Path, points: Float | None) -> Path:
-    """Write a picture of the frame with most framesets from above, with points (N, 3) of its map; return its path.
+def write_plan(found: Optimization, folder: Path, points: Float | None) -> None:
+    """Write a picture of the frame with most framesets from above, with points (N, 3) of its map.
 
     Raises:
         OptimizationError: if the folder cannot be written.
@@ -65,7 +64,6 @@ def write_plan(found: Optimization, folder: Path, points: Float | None) -> Path:
     plan = png(figures.plot_plan(found, numbers, _largest_frames(numbers)[0], points))
     with writing(folder, OptimizationError, "choose another place"):
         replace_file(folder / PLAN, plan)
-    return folder / PLAN
 
 
 def _largest_frames(numbers: Numbers) -> list[int]:
