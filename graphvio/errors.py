@@ -79,6 +79,9 @@ def reading(place: object, error: type[GraphvioError], remedy: str) -> Iterator[
         place: that is read.
         error: type to raise.
         remedy: what to do, the end of the message.
+
+    Raises:
+        GraphvioError: of that type, where the file system refuses to.
     """
     try:
         yield
@@ -88,7 +91,16 @@ def reading(place: object, error: type[GraphvioError], remedy: str) -> Iterator[
 
 @contextmanager
 def writing(place: object, error: type[GraphvioError], remedy: str) -> Iterator[None]:
-    """Raise a failure of the file system as a typed error: as `reading`, of a place that is written to."""
+    """Raise a failure of the file system as a typed error, as `reading` does.
+
+    Args:
+        place: that is written to.
+        error: type to raise.
+        remedy: what to do, the end of the message.
+
+    Raises:
+        GraphvioError: of that type, where the file system refuses to.
+    """
     try:
         yield
     except OSError as failure:
@@ -97,7 +109,16 @@ def writing(place: object, error: type[GraphvioError], remedy: str) -> Iterator[
 
 @contextmanager
 def importing(package: str, extra: str, purpose: str) -> Iterator[None]:
-    """Raise a failing import as a `MissingExtraError` of a package in an extra of graphvio, needed for a purpose."""
+    """Raise a failing import as an error that says how to install what is missing.
+
+    Args:
+        package: that is imported.
+        extra: of graphvio, which the package is in.
+        purpose: what needs it, the beginning of the message.
+
+    Raises:
+        MissingExtraError: if something inside cannot be imported.
+    """
     try:
         yield
     except ImportError:
