@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Mapping
 from functools import reduce
 from operator import xor
 from typing import Any
@@ -121,12 +120,12 @@ class SerialImu:
         self.clock = self.name
         self._path, self._baud = path, baud
         self._port: Any = None
-        self._counts = Counts()
-        self._lines = ImuLines(self.clock, self._counts)
+        self.counts = Counts()
+        self._lines = ImuLines(self.clock, self.counts)
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
-        self._lines = ImuLines(self.clock, self._counts)
+        self._lines = ImuLines(self.clock, self.counts)
         try:
             self._port = self._library.Serial(self._path, self._baud, timeout=_POLL_S, exclusive=True)
             self._port.reset_input_buffer()  # arrival times of buffered data are meaningless
@@ -159,7 +158,3 @@ class SerialImu:
     def detail(self) -> str:
         """See `Device.detail`."""
         return f"IMU, lines at {self._baud} baud"
-
-    def counts(self) -> Mapping[str, int]:
-        """See `Device.counts`."""
-        return self._counts.totals()
