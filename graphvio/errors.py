@@ -1,5 +1,7 @@
 """Typed errors: every message says what is wrong, where, and what to do."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
