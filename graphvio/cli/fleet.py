@@ -87,6 +87,8 @@ def optimize(
     if not no_loops:
         colmap()
     settings = Config.load(reading.config)
+    loaded = None if reading.rig is None else load_rig(reading.rig)
+    parsed = reading_of(reading)
     listed = list_sessions(sessions)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are printed below
     with ends_at_interrupt(f"interrupted; the same command with --out {out} continues from there"), _bars() as bars:
@@ -95,10 +97,10 @@ def optimize(
             listed,
             out,
             settings,
-            rig=None if reading.rig is None else load_rig(reading.rig),
+            rig=loaded,
             with_loops=not no_loops,
             calibrates=refine_calibration,
-            reading=reading_of(reading),
+            reading=parsed,
             scheduler=scheduler,
             workers=workers,
             on_progress=lambda progress: bars.update(

@@ -94,9 +94,10 @@ def open_recording(source: Path, options: ReadingOptions, settings: Config) -> S
     """Open a recording as the options of a command ask for it."""
     from graphvio.rig_files import load_rig
 
+    reading = reading_of(options)
     check_scene(source)
     rig = None if options.rig is None else load_rig(options.rig)
-    recording = reading_of(options).open(source, rig, settings.timing.simultaneous_ms)
+    recording = reading.open(source, rig, settings.timing.simultaneous_ms)
     recording.decodes_in_process = True
     return recording
 
