@@ -28,18 +28,14 @@ Figures = dict[str, float | int | str | None]
 
 
 class Meter:
-    """Counts, rates and latencies of a live run; called from any thread.
-
-    Attributes:
-        max_latency_ms: of the whole run.
-    """
+    """Counts, rates and latencies of a live run; called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._latencies_ms: deque[float] = deque(maxlen=_RECENT)
         self._histogram = np.zeros(_BINS + 1, dtype=np.int64)  # of the whole run
-        self.max_latency_ms = 0.0
+        self.max_latency_ms = 0.0  # of the whole run
         self._arrivals_ns: dict[str, deque[int]] = {}
 
     def count(self, kind: str, by: int = 1) -> None:
