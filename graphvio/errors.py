@@ -1,6 +1,9 @@
 """Typed errors: every message says what is wrong, where, and what to do."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 
 class GraphvioError(Exception):
@@ -68,3 +71,57 @@ class MapError(GraphvioError):
 
 class BenchmarkError(GraphvioError):
     """A data set is not known, or a folder holds none of its sequences."""
+
+
+@contextmanager
+def reading(place: object, error: type[GraphvioError], remedy: str) -> Iterator[None]:
+    """Raise a failure of the file system as a typed error.
+
+    Args:
+        place: that is read.
+        error: type to raise.
+        remedy: what to do, the end of the message.
+
+    Raises:
+        GraphvioError: of that type, where the file system refuses to.
+    """
+    try:
+        yield
+    except OSError as failure:
+        raise error(f"{place}: cannot be read ({failure.strerror or failure}); {remedy}") from None
+
+
+@contextmanager
+def writing(place: object, error: type[GraphvioError], remedy: str) -> Iterator[None]:
+    """Raise a failure of the file system as a typed error, as `reading` does.
+
+    Args:
+        place: that is written to.
+        error: type to raise.
+        remedy: what to do, the end of the message.
+
+    Raises:
+        GraphvioError: of that type, where the file system refuses to.
+    """
+    try:
+        yield
+    except OSError as failure:
+        raise error(f"{place}: cannot be written ({failure.strerror or failure}); {remedy}") from None
+
+
+@contextmanager
+def importing(package: str, extra: str, purpose: str) -> Iterator[None]:
+    """Raise a failing import as an error that says how to install what is missing.
+
+    Args:
+        package: that is imported.
+        extra: of graphvio, which the package is in.
+        purpose: what needs it, the beginning of the message.
+
+    Raises:
+        MissingExtraError: if something inside cannot be imported.
+    """
+    try:
+        yield
+    except ImportError:
+        raise MissingExtraError(package, extra, purpose) from None

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import SessionError, TrajectoryError
+from graphvio.errors import SessionError, TrajectoryError, writing
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from graphvio.sessions.store import SUFFIXES, is_store
 from graphvio.sessions.truth import read_poses
@@ -69,10 +69,8 @@ def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
         TrajectoryError: if the file cannot be written.
     """
     text = "".join(f"{tum_line(int(s), p)}\n" for s, p in zip(trajectory.stamps_ns, trajectory.nav_T_body, strict=True))
-    try:
+    with writing(path, TrajectoryError, "choose another place"):
         Path(path).write_text(text, encoding="ascii")
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def tum_line(stamp_ns: int, nav_T_body: Float) -> str:

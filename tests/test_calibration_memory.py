@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.calibration_differences import calibration_differences
 from typer.testing import CliRunner
 
 from graphvio.calibration_sigmas import FACTORY
@@ -17,7 +18,7 @@ from graphvio.errors import RigError
 from graphvio.live.calibration_memory import CalibrationMemory, devices_of, widened
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
-from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.default_rig import default_rig
 
 KEPT, LEARNT, OTHER = "kept for the next run of simulator-room", "as learnt by the run of ", "is of another rig file"

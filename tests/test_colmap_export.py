@@ -19,7 +19,7 @@ from graphvio.arrays import Float
 from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
-from graphvio.optimization.colmap_export import ColmapModel, export
+from graphvio.optimization.colmap_export import export
 from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.loops.database import FeatureDatabase, colmap_camera, image_name
 from graphvio.optimization.loops.features import extract_places
@@ -41,7 +41,6 @@ class Exported:
     session: SessionInput
     optimization: Optimization
     folder: Path
-    models: list[ColmapModel]
 
     @property
     def database(self) -> Path:
@@ -81,8 +80,8 @@ def export_of(source: Source, folder: Path) -> Exported:
     with FeatureDatabase(folder / "database.db") as database:
         stamps = [place.stamp_ns for place in places]
         extract_places(source, source.rig, NAME, stamps, database, config)
-        models = export(optimization, [session], database, folder, config)
-    return Exported(session, optimization, folder, models)
+        export(optimization, [session], database, folder, config)
+    return Exported(session, optimization, folder)
 
 
 @pytest.fixture
@@ -94,7 +93,11 @@ def again(exported: Exported, tmp_path: Path) -> Iterator[tuple[FeatureDatabase,
 
 
 def read(exported: Exported) -> Any:
-    return pycolmap.Reconstruction(exported.models[0].folder)
+    return read_model(exported.folder, 0)
+
+
+def read_model(folder: Path, number: int) -> Any:
+    return pycolmap.Reconstruction(folder / "sparse" / str(number))
 
 
 def test_export_rig_frames_and_images_are_the_database_s(exported: Exported) -> None:
@@ -153,10 +156,12 @@ def test_export_poses_are_the_optimisation_s(exported: Exported) -> None:
 
 
 def test_export_points_have_many_observations_within_a_pixel(exported: Exported) -> None:
-    (described,), model = exported.models, read(exported)
-    assert described.reprojection_error_px < 0.5
-    assert described.observations > 3.0 * described.points
-    assert (described.points, described.observations) == (model.num_points3D(), model.compute_num_observations())
+    model = read(exported)
+    assert [path.name for path in (exported.folder / "sparse").iterdir()] == ["0"]
+    lengths = np.array([point.track.length() for point in model.points3D.values()])
+    mean_px = float(lengths @ [point.error for point in model.points3D.values()]) / float(lengths.sum())
+    assert mean_px < 0.5
+    assert model.compute_num_observations() > 3.0 * model.num_points3D()
     errors = []
     for image in model.images.values():
         camera = exported.session.rig.cameras[sorted(model.cameras).index(image.camera_id)]
@@ -165,8 +170,8 @@ def test_export_points_have_many_observations_within_a_pixel(exported: Exported)
         cam_T_world = image.cam_from_world().matrix()
         pixels, _ = camera.project(points @ cam_T_world[:, :3].T + cam_T_world[:, 3])
         errors += np.linalg.norm(pixels + 0.5 - [each.xy for each in seen], axis=1).tolist()
-    assert len(errors) == described.observations
-    assert np.mean(errors) == pytest.approx(described.reprojection_error_px, rel=1e-6)
+    assert len(errors) == model.compute_num_observations() == lengths.sum()
+    assert np.mean(errors) == pytest.approx(mean_px, rel=1e-6)
 
 
 def test_export_points_lie_on_true_surfaces(exported: Exported) -> None:
@@ -243,10 +248,13 @@ def test_export_refused_loop_closure_makes_no_points(exported: Exported, again: 
     database.add_matches(names[0], names[1], rows)
     closure = LoopClosure(places[0], places[-1], np.eye(4), np.eye(6), 100, ((0, 0),), False)
     refused = replace(exported.optimization, loops=[JudgedLoop(closure, "far from the solution", 1e3)])
-    (model,) = export(refused, [exported.session], database, folder, Config())
+    export(refused, [exported.session], database, folder, Config())
     assert (names[0], names[1]) not in database.verified_pairs()
     np.testing.assert_array_equal(database.all_matches(names[0], names[1]), rows)
-    assert (model.points, model.observations) == (exported.models[0].points, exported.models[0].observations)
+    assert [path.name for path in (folder / "sparse").iterdir()] == ["0"]
+    model, before = read_model(folder, 0), read(exported)
+    assert model.num_points3D() == before.num_points3D()
+    assert model.compute_num_observations() == before.compute_num_observations()
 
 
 def test_export_used_loop_closure_verifies_matches_by_poses(
@@ -275,11 +283,13 @@ def test_export_frames_are_models_the_largest_first(exported: Exported, again: t
     session = exported.optimization.sessions[0]
     parted = np.where(np.arange(len(session.frame)) < exported.session.places[2].row, 0, 1)
     apart = replace(exported.optimization, sessions=[replace(session, frame=parted)])
-    models = export(apart, [exported.session], database, folder, Config())
-    assert [each.frame for each in models] == [1, 0]
-    assert [each.places for each in models] == [len(exported.session.places) - 2, 2]
+    export(apart, [exported.session], database, folder, Config())
     assert sorted(path.name for path in (folder / "sparse").iterdir()) == ["0", "1"]
-    first, second = (pycolmap.Reconstruction(each.folder) for each in models)
+    first, second = (read_model(folder, number) for number in range(2))
+    for model, places in ((first, exported.session.places[2:]), (second, exported.session.places[:2])):
+        assert model.num_frames() == len(places)
+        stamps = {int(Path(image.name).stem) for image in model.images.values()}
+        assert stamps == {place.stamp_ns for place in places}
     assert not set(first.images) & set(second.images)
     assert min(first.num_points3D(), second.num_points3D()) > 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -37,6 +37,9 @@ class Script:
         self.name = name
         self.lives, self.absences = iter(lives), absences
         self.started, self.stops = 0, 0
+        self.counts = Counts()
+        self.counts.add("frames_lost", 3)
+        self.counts.add("other", 0)
 
     def start(self, hand_over: HandOver) -> None:
         if self.started and self.absences:
@@ -58,9 +61,6 @@ class Script:
 
     def detail(self) -> str:
         return "model"
-
-    def counts(self) -> Mapping[str, int]:
-        return {"frames_lost": 3, "other": 0}
 
 
 def take(readings: Iterator[Reading], count: int) -> list[Reading]:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from benchmarks.calibration_differences import calibration_differences
 from command_line import graphvio
 from live_runs import SOON_S, all_of, assert_same
 from real_clip import CLIP, real_clip
@@ -60,7 +61,7 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import INTRINSICS, PLACE, SINGLE, has_coefficient, moved_cameras
 from graphvio.self_calibration.prior import file_prior
 from graphvio.simulation import default_rig
-from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
 from graphvio.slam.service.convert import keyframe_message, keyframe_of

@@ -153,9 +153,9 @@ class Page(HTMLParser):
 
 
 def report(found: Optimization, folder: Path, truths: list[Trajectory | None]) -> tuple[Page, dict[str, Any]]:
-    path = write_report(found, folder, truths)
+    write_report(found, folder, truths)
     assert {file.name for file in folder.iterdir()} == {"report.html", "summary.json"}
-    html = path.read_text(encoding="utf-8")
+    html = (folder / "report.html").read_text(encoding="utf-8")
     assert "://" not in html  # base64 may spell http, but has no colon
     return Page(html), json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
@@ -231,7 +231,8 @@ def test_write_plan_shows_trajectory_loops_and_points(one: Optimization, tmp_pat
     few = np.random.default_rng(0).normal([3.0, 5.0, 0.0], 1.0, (500, 3))
     for name, points in {"none": None, "empty": np.zeros((0, 3)), "some": few}.items():
         (tmp_path / name).mkdir()
-        image = matplotlib.image.imread(write_plan(one, tmp_path / name, points))[..., :3]
+        write_plan(one, tmp_path / name, points)
+        image = matplotlib.image.imread(tmp_path / name / "plan.png")[..., :3]
         red, green, blue = np.moveaxis(image, 2, 0)
         grey = (np.ptp(image, axis=2) < 0.02) & (red > 0.4) & (red < 0.7)
         counts[name] = [int(each.sum()) for each in (grey, blue - red > 0.3, green - red > 0.2)]
@@ -364,7 +365,8 @@ def test_write_report_incomplete_session_is_a_doubt(
     odometry = tmp_path / "ring<1>" / "odometry"
     odometry.mkdir(parents=True)
     (odometry / "summary.json").write_text(json.dumps({"completion": completion}))
-    html = write_report(replace(one, loops=one.loops[:1]), tmp_path, [None]).read_text(encoding="utf-8")
+    write_report(replace(one, loops=one.loops[:1]), tmp_path, [None])
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert ("Only 89 % of the framesets" in html) == is_doubtful
     assert ("Read before use" in html) == is_doubtful
     assert json.loads((tmp_path / "summary.json").read_text())["sessions"][0]["completion"] == completion

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.calibration_differences import calibration_differences
 from calibration_walks import planar, recorded
 from scipy.stats import chi2
 from typer.testing import CliRunner, Result
@@ -25,7 +26,7 @@ from graphvio.self_calibration.batch import Batch, calibrate_windows, difference
 from graphvio.self_calibration.collector import FullWindow
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO
-from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.default_rig import default_rig
 from graphvio.sources import open_source
 

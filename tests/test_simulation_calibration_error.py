@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from benchmarks.calibration_differences import calibration_differences
 from recordings import half_size_rig
 from scipy.stats import chi2
 from typer.testing import CliRunner
@@ -25,7 +26,7 @@ from graphvio.simulation import (
     default_rig,
     simulate,
 )
-from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, calibration_differences, draw
+from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, draw
 from graphvio.simulation.imu import ideal_readings, measure
 from graphvio.simulation.rig_change import Knock, RigChange, ThermalDrift
 

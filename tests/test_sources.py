@@ -716,7 +716,7 @@ def test_read_ahead_is_bounded_and_in_order() -> None:
 
 def test_read_ahead_works_while_its_consumer_does() -> None:
     begun = threading.Semaphore(0)
-    results = read_ahead(lambda _: begun.release(), range(10), depth=4, threads=2)
+    results = read_ahead(lambda _: begun.release(), range(10), depth=4)
     next(results)
     for _ in range(1 + 4):  # the consumer asks for nothing meanwhile
         assert begun.acquire(timeout=30.0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphvio.benchmark.run import Outcome
 from graphvio.benchmark.table import Benchmark
-from graphvio.errors import BenchmarkError
+from graphvio.errors import BenchmarkError, writing
 from graphvio.reporting.figures import BLUE, add_axes, empty_figure, png
 from graphvio.reporting.files import replace_file
 from graphvio.reporting.html import render
@@ -29,7 +29,7 @@ def write_report(benchmark: Benchmark, folder: Path) -> Path:
         BenchmarkError: if the folder cannot be written.
     """
     pages = {outcome.sequence: f"{outcome.sequence}.html" for outcome in benchmark.outcomes if not outcome.has_failed}
-    try:
+    with writing(folder, BenchmarkError, "choose another place"):
         for outcome in benchmark.outcomes:
             if not outcome.has_failed:
                 replace_file(folder / pages[outcome.sequence], _sequence_page(benchmark, outcome))
@@ -45,8 +45,6 @@ def write_report(benchmark: Benchmark, folder: Path) -> Path:
                 pages=pages,
             ),
         )
-    except OSError as error:
-        raise BenchmarkError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
     return index
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from graphvio.benchmark.datasets import Sequence as Recorded
-from graphvio.errors import BenchmarkError, GraphvioError, TrajectoryError
+from graphvio.errors import BenchmarkError, GraphvioError, TrajectoryError, writing
 from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
 from graphvio.rig_files import load_rig
 from graphvio.sources import open_source
@@ -73,12 +73,10 @@ def run_sequences(
     Raises:
         BenchmarkError: if the folder is not empty or cannot be written.
     """
-    try:
+    with writing(out, BenchmarkError, "name another folder"):
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise BenchmarkError(f"{out}: is not empty, and results are never overwritten; name another folder")
-    except OSError as error:
-        raise BenchmarkError(f"{out}: cannot be written ({error.strerror}); name another folder") from None
     processes = _Processes()
     outcomes = []
     with ThreadPoolExecutor(jobs) as pool:

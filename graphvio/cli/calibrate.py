@@ -10,7 +10,7 @@ import typer
 
 from graphvio.cli import completion, options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_INCOMPLETE, names_of, open_recording, reading_of, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, names_of, open_recording, warn
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -95,8 +95,10 @@ def calibrate(
     _check_outputs(out, report, [] if rig is None else [rig])
     is_of_pairs = _is_of_pairs(what, {"--correct-imu": correct_imu, "--guide": guide, "--scale": scale != "auto"})
     settings = Config.load(config)
-    reading = reading_of(pairs=pairs, cameras=cameras, no_pairs=no_pairs, from_s=from_s, to_s=to_s, topics=topics)
-    opened = open_recording(source, rig, settings, reading)
+    reading = options.ReadingOptions(
+        rig=rig, topics=topics, pairs=pairs, cameras=cameras, no_pairs=no_pairs, from_s=from_s, to_s=to_s
+    )
+    opened = open_recording(source, reading, settings)
     if not is_of_pairs:
         calibrate_rig(opened, settings, what, out, report)
         return

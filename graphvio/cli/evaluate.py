@@ -50,7 +50,7 @@ def evaluate(
 
     from rich.console import Console
 
-    from graphvio.errors import GraphvioError
+    from graphvio.errors import GraphvioError, writing
     from graphvio.evaluation import evaluate as measure
     from graphvio.trajectory_files import load_trajectory
 
@@ -60,10 +60,8 @@ def evaluate(
     publish(figures.as_dict())
     Console().print(_table(figures))
     if json_file is not None:
-        try:
+        with writing(json_file, GraphvioError, "choose another place"):
             json_file.write_text(json.dumps(figures.as_dict(), indent=2) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise GraphvioError(f"{json_file}: cannot be written ({error.strerror}); choose another place") from None
     if plot is not None:
         from graphvio.results.plotting import plot_evaluation
 

@@ -53,19 +53,11 @@ def optimize(
             "--out", help="Folder for the results, path or URL: new, or that of a run to continue.", metavar="DIR"
         ),
     ],
+    reading: options.ReadingOptions,
     scheduler: _Scheduler = None,
     workers: _Workers = None,
-    rig: options.RigFile = None,
-    topics: options.Topics = None,
-    config: options.ConfigName = "default",
-    pairs: options.Pairs = None,
-    cameras: options.Cameras = None,
-    no_pairs: options.NoPairs = False,
-    no_imu: options.NoImu = False,
     no_loops: options.NoLoops = False,
     refine_calibration: options.RefineCalibration = False,
-    from_s: options.FromS = None,
-    to_s: options.ToS = None,
 ) -> None:
     """Optimise many sessions, each by itself, and write a table.
 
@@ -94,11 +86,9 @@ def optimize(
     distributed()
     if not no_loops:
         colmap()
-    settings = Config.load(config)
-    loaded = None if rig is None else load_rig(rig)
-    reading = reading_of(
-        pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
-    )
+    settings = Config.load(reading.config)
+    loaded = None if reading.rig is None else load_rig(reading.rig)
+    parsed = reading_of(reading)
     listed = list_sessions(sessions)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are printed below
     with ends_at_interrupt(f"interrupted; the same command with --out {out} continues from there"), _bars() as bars:
@@ -110,7 +100,7 @@ def optimize(
             rig=loaded,
             with_loops=not no_loops,
             calibrates=refine_calibration,
-            reading=reading,
+            reading=parsed,
             scheduler=scheduler,
             workers=workers,
             on_progress=lambda progress: bars.update(

@@ -34,13 +34,11 @@ def info(
 
         graphvio info mh01.mcap
     """
-    from graphvio.errors import SourceError
+    from graphvio.errors import SourceError, reading
     from graphvio.sessions.store import is_store
 
-    try:
+    with reading(source, SourceError, "check the path"):
         is_session = is_store(source)
-    except OSError as error:
-        raise SourceError(f"{source}: cannot be read ({error.strerror}); check the path") from None
     check_scene(source)
     if is_session:
         _show_session(source, rig)

@@ -45,12 +45,17 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
     """Add ``--json`` to a command that publishes its result; its lines on stdout are then left out.
 
     A command that ends with an exit code of its own still prints the document; of one that fails, `graphvio.cli.main`
-    prints the error. ``--verbose`` is added, too, which `graphvio.cli.main` looks for.
+    prints the error. ``--verbose`` is added, too, which `graphvio.cli.main` looks for. A parameter whose type is a
+    dataclass of options, see `graphvio.cli.options`, becomes these options.
     """
+    hints = get_type_hints(command, include_extras=True)
+    groups = {name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)}
 
     @wraps(command)
     def run(*, verbose: bool = False, as_json: bool = False, **values: Any) -> None:
         """Run the command; with ``as_json``, print its document alone."""
+        for name, group in groups.items():
+            values[name] = group(**{each: values.pop(each) for each in inspect.signature(group).parameters})
         if not as_json:
             command(**values)
             return
@@ -69,19 +74,26 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
         if code is not None:
             raise code
 
-    hints = get_type_hints(command, include_extras=True)
-    added = {"verbose": options.Verbose, "as_json": _Json}
-    parameters = [
-        each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name])
-        for name, each in inspect.signature(command).parameters.items()
-    ]
+    parameters = _parameters(command)
     parameters += [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-        for name, kind in added.items()
+        for name, kind in (("verbose", options.Verbose), ("as_json", _Json))
     ]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {**hints, **added}
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
     return run
+
+
+def _parameters(command: Callable[..., object]) -> list[inspect.Parameter]:
+    """Return the parameters of a command or of a dataclass of options, with such dataclasses expanded."""
+    hints = get_type_hints(command, include_extras=True)
+    found: list[inspect.Parameter] = []
+    for name, each in inspect.signature(command).parameters.items():
+        if is_dataclass(hints[name]):
+            found += _parameters(hints[name])
+        else:
+            found.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name]))
+    return found
 
 
 def plain(value: object) -> object:

@@ -20,19 +20,12 @@ def live(
         ),
     ] = None,
     list_devices: Annotated[bool, typer.Option("--list", help="List the connected devices, and end.")] = False,
-    rig: options.RigFile = None,
-    cameras: options.Cameras = None,
-    no_pairs: options.NoPairs = False,
-    config: options.ConfigName = "default",
-    record: options.Record = None,
-    png: options.Png = False,
+    *,
+    asked: options.LiveOptions,
     view: options.View = False,
     serve: Annotated[
         bool, typer.Option("--serve", help="Serve other programs of this machine, see graphvio serve.")
     ] = False,
-    health_port: options.HealthPort = None,
-    duration: options.Duration = None,
-    forget_calibration: options.ForgetCalibration = False,
 ) -> None:
     """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM, which leave a complete recording.
 
@@ -56,7 +49,7 @@ def live(
         return
     if source is None:
         raise typer.BadParameter("give a SOURCE, or --list to see the connected devices")
-    from graphvio.cli.live_run import LiveOptions, run_live
+    from graphvio.cli.live_run import run_live
     from graphvio.cli.services import Services
 
     services = None
@@ -64,22 +57,7 @@ def live(
         from graphvio.slam.service.options import ServiceOptions
 
         services = Services(ServiceOptions())
-    run_live(
-        LiveOptions(
-            source=source,
-            rig=rig,
-            config=config,
-            cameras=cameras,
-            no_pairs=no_pairs,
-            record=record,
-            png=png,
-            view=view,
-            health_port=health_port,
-            duration_s=duration,
-            forget_calibration=forget_calibration,
-            services=services,
-        )
-    )
+    run_live(source, asked, services, view=view)
 
 
 def _list() -> None:

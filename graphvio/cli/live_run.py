@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ import typer
 
 from graphvio.cli.dashboard import Dashboard, line_of, summary_of
 from graphvio.cli.json_output import publish
+from graphvio.cli.options import LiveOptions, ReadingOptions
 from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, reading_of, warn
 from graphvio.cli.warming import warm_up_visibly
 from graphvio.config import Config
@@ -34,42 +34,31 @@ if TYPE_CHECKING:
     from graphvio.viewer import Viewer
 
 
-@dataclass(frozen=True, kw_only=True)
-class LiveOptions:
-    """What a live run is asked for."""
+def run_live(spec: str, options: LiveOptions, services: Services | None, view: bool = False) -> None:
+    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end.
 
-    source: str  # ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path
-    rig: Path | None  # rig or calibration file, or None for what the source carries
-    config: str  # profile, or YAML file
-    cameras: str | None  # the only cameras to be used, such as ``cam0,cam1``, or None for all
-    no_pairs: bool  # whether cameras are used without their partners
-    record: Path | None  # session to be written, or None
-    png: bool  # whether its images are compressed
-    view: bool  # whether the viewer's window opens
-    health_port: int | None  # port of health and metrics, or None for none
-    duration_s: float | None  # the run ends after so many seconds, or with the source if None
-    forget_calibration: bool  # whether what earlier runs learnt of the calibration is forgotten
-    services: Services | None  # for other programs, or None
-
-
-def run_live(options: LiveOptions) -> None:
-    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
+    Args:
+        spec: the source, ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path.
+        options: of the command.
+        services: for other programs, or None.
+        view: whether the viewer's window opens.
+    """
     _check_recording(options)
     share_heap()
     config = Config.load(options.config)
-    if options.services is not None:
-        config = options.services.settings(config)
-    source = _source_of(options)
-    if options.services is not None:
-        options.services.check()
+    if services is not None:
+        config = services.settings(config)
+    source = _source_of(spec, options)
+    if services is not None:
+        services.check()
     with ExitStack() as stack:
         stack.callback(source.close)
         with sigterm_as_interrupt():  # nothing has to be saved yet
-            rig, memory = _prepare(source, config, options)
+            rig, memory = _prepare(spec, source, config, options)
         signals = stack.enter_context(StopSignals())
         recording = stack.enter_context(ExitStack())  # closed after the run, so that it is complete
-        viewer = _viewer(stack, rig, options)
-        running = LiveOdometry(source, rig, config, wants_keyframes=options.services is not None)
+        viewer = _viewer(stack, rig, services, view)
+        running = LiveOdometry(source, rig, config, wants_keyframes=services is not None)
         stack.callback(running.stop)
         if viewer is not None:
             running.add_output(ViewOutput(viewer, lambda: running.odometry.calibration))
@@ -78,8 +67,8 @@ def run_live(options: LiveOptions) -> None:
             stack.callback(health.close)
             typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
         started = None
-        if options.services is not None:
-            started = options.services.start(running, stack, lambda: signals.came)
+        if services is not None:
+            started = services.start(running, stack, lambda: signals.came)
             for line in started.lines:
                 typer.echo(line, err=True)
         recorder = None
@@ -126,26 +115,30 @@ def _check_recording(options: LiveOptions) -> None:
         raise SessionError(f"{path}: {path.parent} is no folder; make it first")
 
 
-def _source_of(options: LiveOptions) -> LiveSource:
+def _source_of(spec: str, options: LiveOptions) -> LiveSource:
     """Make a source as the options of a command ask for it; no sensor is started."""
     from graphvio.live.source import SelectedCameras
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
 
-    source = open_live_source(options.source, None if options.rig is None else load_rig(options.rig))
+    source = open_live_source(spec, None if options.rig is None else load_rig(options.rig))
     if options.cameras is None and not options.no_pairs:
         return source
-    return SelectedCameras(source, reading_of(cameras=options.cameras, no_pairs=options.no_pairs).of)
+    return SelectedCameras(source, reading_of(ReadingOptions(cameras=options.cameras, no_pairs=options.no_pairs)).of)
 
 
-def _prepare(source: LiveSource, config: Config, options: LiveOptions) -> tuple[Rig, CalibrationMemory | None]:
+def _prepare(
+    spec: str, source: LiveSource, config: Config, options: LiveOptions
+) -> tuple[Rig, CalibrationMemory | None]:
     """Open a source and load the kernels.
 
     Returns:
         The source's rig, calibrated as earlier runs learnt, and the memory of that; None where none is kept.
     """
+    from graphvio.live.calibration_memory import devices_of
+
     rig = source.open()
-    memory = _memory(source.name, rig, config, options)
+    memory = _memory(devices_of(spec, source.name), rig, config, options)
     if memory is not None:
         rig = _remembered(memory, rig)
     set_up_threads()
@@ -153,11 +146,10 @@ def _prepare(source: LiveSource, config: Config, options: LiveOptions) -> tuple[
     return rig, memory
 
 
-def _memory(name: str, rig: Rig, config: Config, options: LiveOptions) -> CalibrationMemory | None:
+def _memory(devices: str | None, rig: Rig, config: Config, options: LiveOptions) -> CalibrationMemory | None:
     """Return the memory of a source's calibration, emptied if it is to be, or None where none is kept."""
-    from graphvio.live.calibration_memory import CalibrationMemory, devices_of
+    from graphvio.live.calibration_memory import CalibrationMemory
 
-    devices = devices_of(options.source, name)
     if devices is None or not config.estimates_calibration:
         return None
     memory = CalibrationMemory(devices, rig)
@@ -189,13 +181,12 @@ def _remembered(memory: CalibrationMemory, rig: Rig) -> Rig:
 # ---------------------------------------------------------------------- around the run
 
 
-def _viewer(stack: ExitStack, rig: Rig, options: LiveOptions) -> Viewer | None:
+def _viewer(stack: ExitStack, rig: Rig, services: Services | None, view: bool) -> Viewer | None:
     """Open the viewer, if it is asked for, until the stack closes."""
     from graphvio.viewer import Viewer, WebOptions
 
-    services = options.services
     web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
-    viewer = stack.enter_context(Viewer(rig, spawn=options.view, web=web)) if options.view or web is not None else None
+    viewer = stack.enter_context(Viewer(rig, spawn=view, web=web)) if view or web is not None else None
     if web is not None:
         typer.echo(f"browser: {web.url}", err=True)
     return viewer
@@ -212,7 +203,7 @@ def _run_until_end(
     Returns:
         The error by which it ended, to be raised after everything until then is saved; None if there was none.
     """
-    until = None if options.duration_s is None else monotonic() + options.duration_s
+    until = None if options.duration is None else monotonic() + options.duration
     try:
         with Dashboard(name, running.events.subscribe(64)) as dashboard:
             while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):

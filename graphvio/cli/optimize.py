@@ -15,7 +15,6 @@ from graphvio.cli.shared import (
     MIN_COMPLETION,
     ends_at_interrupt,
     open_recording,
-    reading_of,
     stage_bars,
     warn,
 )
@@ -32,9 +31,7 @@ def optimize(
             metavar="SOURCE",
         ),
     ],
-    rig: options.RigFile = None,
-    topics: options.Topics = None,
-    config: options.ConfigName = "default",
+    reading: options.ReadingOptions,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -44,14 +41,8 @@ def optimize(
             metavar="DIR",
         ),
     ] = None,
-    pairs: options.Pairs = None,
-    cameras: options.Cameras = None,
-    no_pairs: options.NoPairs = False,
-    no_imu: options.NoImu = False,
     no_loops: options.NoLoops = False,
     refine_calibration: options.RefineCalibration = False,
-    from_s: options.FromS = None,
-    to_s: options.ToS = None,
 ) -> None:
     """Optimise the trajectory of recorded sessions from all their measurements.
 
@@ -80,11 +71,8 @@ def optimize(
 
     if not no_loops:
         colmap()  # before hours of work, not after
-    settings = Config.load(config)
-    reading = reading_of(
-        pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
-    )
-    opened = [open_recording(source, rig, settings, reading) for source in sources]
+    settings = Config.load(reading.config)
+    opened = [open_recording(source, reading, settings) for source in sources]
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -118,3 +119,33 @@ Times = Annotated[
     typer.Option("--times", help="Stamps of KITTI poses, seconds, one a line.  [default: times.txt next to them]"),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions:
+    """What is read of recordings, and the configuration."""
+
+    rig: RigFile = None
+    topics: Topics = None
+    config: ConfigName = "default"
+    pairs: Pairs = None
+    cameras: Cameras = None
+    no_pairs: NoPairs = False
+    no_imu: NoImu = False
+    from_s: FromS = None
+    to_s: ToS = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """What all live runs may be asked for."""
+
+    rig: RigFile = None
+    cameras: Cameras = None
+    no_pairs: NoPairs = False
+    config: ConfigName = "default"
+    record: Record = None
+    png: Png = False
+    health_port: HealthPort = None
+    duration: Duration = None
+    forget_calibration: ForgetCalibration = False

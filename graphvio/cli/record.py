@@ -16,7 +16,6 @@ from graphvio.cli.shared import (
     ends_at_interrupt,
     framesets_bar,
     open_recording,
-    reading_of,
     warn,
 )
 
@@ -57,8 +56,8 @@ def record(
 
     check_session_name(out)
     settings = Config.load(config)
-    reading = reading_of(no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
-    opened = open_recording(source, rig, settings, reading)
+    reading = options.ReadingOptions(rig=rig, topics=topics, no_imu=no_imu, from_s=from_s, to_s=to_s)
+    opened = open_recording(source, reading, settings)
     set_up_threads()
     warm_up_visibly(opened.rig, settings)
     writer = SessionWriter(out, opened.rig, "png" if png else "raw")
@@ -107,7 +106,8 @@ def convert(
     from graphvio.sessions.formats import format_of, open_writer
 
     known = format_of(out, file_format)
-    opened = open_recording(source, rig, Config(), reading_of(from_s=from_s, to_s=to_s, topics=topics))
+    reading = options.ReadingOptions(rig=rig, topics=topics, from_s=from_s, to_s=to_s)
+    opened = open_recording(source, reading, Config())
     truth = _truth(opened, is_whole=from_s is None and to_s is None)
     writer = open_writer(out, opened.rig, known, "png" if png else "raw")
     _write(opened, truth, writer, None)

@@ -15,7 +15,6 @@ from graphvio.cli.shared import (
     TerminalDisplay,
     ends_at_interrupt,
     open_recording,
-    reading_of,
     warn,
 )
 
@@ -29,18 +28,10 @@ _MAX_DOUBTFUL_SHARE = 0.3  # of all framesets
 
 def run(
     source: options.Source,
-    rig: options.RigFile = None,
-    topics: options.Topics = None,
-    config: options.ConfigName = "default",
+    reading: options.ReadingOptions,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results, new or empty.  [default: results/NAME-N]")
     ] = None,
-    pairs: options.Pairs = None,
-    cameras: options.Cameras = None,
-    no_pairs: options.NoPairs = False,
-    no_imu: options.NoImu = False,
-    from_s: options.FromS = None,
-    to_s: options.ToS = None,
     view: options.View = False,
     save_rrd: options.SaveRrd = None,
 ) -> None:
@@ -68,11 +59,8 @@ def run(
     from graphvio.runtime import set_up_threads
     from graphvio.viewer import Viewer
 
-    settings = Config.load(config)
-    reading = reading_of(
-        pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
-    )
-    opened = open_recording(source, rig, settings, reading)
+    settings = Config.load(reading.config)
+    opened = open_recording(source, reading, settings)
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))

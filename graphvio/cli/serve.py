@@ -12,10 +12,7 @@ from graphvio.cli import options
 
 def serve(
     source: options.LiveSource,
-    rig: options.RigFile = None,
-    cameras: options.Cameras = None,
-    no_pairs: options.NoPairs = False,
-    config: options.ConfigName = "default",
+    asked: options.LiveOptions,
     host: Annotated[str, typer.Option("--host", help="Address of gRPC; others need TLS and a token.")] = "127.0.0.1",
     port: Annotated[
         int | None, typer.Option("--port", help="Port of gRPC; 0 takes any.  [default: 50551]", min=0, max=65535)
@@ -30,11 +27,6 @@ def serve(
     ] = None,
     ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
-    record: options.Record = None,
-    png: options.Png = False,
-    health_port: options.HealthPort = None,
-    duration: options.Duration = None,
-    forget_calibration: options.ForgetCalibration = False,
 ) -> None:
     """Run the odometry on live sensors and serve estimates and keyframes by gRPC, ROS 2 topics and to browsers.
 
@@ -48,24 +40,9 @@ def serve(
 
         graphvio serve oak --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file token
     """
-    from graphvio.cli.live_run import LiveOptions, run_live
+    from graphvio.cli.live_run import run_live
     from graphvio.cli.services import Services
     from graphvio.slam.service.options import DEFAULT_PORT, ServiceOptions
 
     grpc = ServiceOptions(host, DEFAULT_PORT if port is None else port, certificate, key, token_file)
-    run_live(
-        LiveOptions(
-            source=source,
-            rig=rig,
-            config=config,
-            cameras=cameras,
-            no_pairs=no_pairs,
-            record=record,
-            png=png,
-            view=False,
-            health_port=health_port,
-            duration_s=duration,
-            forget_calibration=forget_calibration,
-            services=Services(grpc, ros2, web),
-        )
-    )
+    run_live(source, asked, Services(grpc, ros2, web))

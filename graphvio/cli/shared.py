@@ -14,6 +14,7 @@ from graphvio.cli.json_output import error_document, publish
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from graphvio.cli.options import ReadingOptions
     from graphvio.config import Config
     from graphvio.sources import Source
     from graphvio.sources.reading import Reading
@@ -89,40 +90,36 @@ def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
     return load_trajectory(path, times)
 
 
-def open_recording(source: Path, rig: Path | None, settings: Config, reading: Reading) -> Source:
-    """Open a recording as the options of a command ask for it, see `reading_of`."""
+def open_recording(source: Path, options: ReadingOptions, settings: Config) -> Source:
+    """Open a recording as the options of a command ask for it."""
     from graphvio.rig_files import load_rig
 
+    reading = reading_of(options)
     check_scene(source)
-    recording = reading.open(source, None if rig is None else load_rig(rig), settings.timing.simultaneous_ms)
+    rig = None if options.rig is None else load_rig(options.rig)
+    recording = reading.open(source, rig, settings.timing.simultaneous_ms)
     recording.decodes_in_process = True
     return recording
 
 
-def reading_of(
-    *,
-    pairs: str | None = None,
-    cameras: str | None = None,
-    no_pairs: bool = False,
-    no_imu: bool = False,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    topics: str | None = None,
-) -> Reading:
-    """Parse what the options of a command, see `graphvio.cli.options`, say of what is read."""
+def reading_of(options: ReadingOptions) -> Reading:
+    """Parse what the options of a command say of what is read."""
     from graphvio.errors import RigError, SourceError
     from graphvio.sources.reading import Reading
 
     try:
-        numbers = None if pairs is None else tuple(int(each) for each in pairs.split(","))
+        numbers = None if options.pairs is None else tuple(int(each) for each in options.pairs.split(","))
     except ValueError:
-        raise RigError(f"--pairs {pairs!r}: give numbers separated by commas, such as 0,1") from None
-    names = None if cameras is None else tuple(name.strip() for name in cameras.split(","))
-    mapped = [each.split("=") for each in (topics or "").split(",") if each]
+        raise RigError(f"--pairs {options.pairs!r}: give numbers separated by commas, such as 0,1") from None
+    names = None if options.cameras is None else tuple(name.strip() for name in options.cameras.split(","))
+    mapped = [each.split("=") for each in (options.topics or "").split(",") if each]
     if any(len(pair) != 2 or not all(pair) for pair in mapped):
-        raise SourceError(f"--topics {topics}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
+        raise SourceError(
+            f"--topics {options.topics}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu"
+        )
     topic_of = {name.strip(): topic.strip() for name, topic in mapped}
-    return Reading(numbers, names, not no_pairs, not no_imu, tuple(topic_of.items()), from_s, to_s)
+    with_pairs, with_imu = not options.no_pairs, not options.no_imu
+    return Reading(numbers, names, with_pairs, with_imu, tuple(topic_of.items()), options.from_s, options.to_s)
 
 
 def check_scene(source: Path) -> None:

@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 
 def slam(
     source: options.LiveSource,
-    rig: options.RigFile = None,
-    config: options.ConfigName = "default",
-    cameras: options.Cameras = None,
-    no_pairs: options.NoPairs = False,
+    asked: options.LiveOptions,
     saved_map: Annotated[
         Path | None, typer.Option("--map", help="Saved map to localise in and to extend.", metavar="DIR")
     ] = None,
@@ -35,11 +32,6 @@ def slam(
     ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
     save_rrd: options.SaveRrd = None,
-    record: options.Record = None,
-    png: options.Png = False,
-    health_port: options.HealthPort = None,
-    duration: options.Duration = None,
-    forget_calibration: options.ForgetCalibration = False,
 ) -> None:
     """Run the odometry with a small SLAM system in a process of its own, which corrects the pose in the map.
 
@@ -64,26 +56,11 @@ def slam(
             raise MapError(f"{out}: holds a map already; name another folder, or extend it by  --map {out}")
     if save_rrd is not None and save_rrd.exists():
         raise MapError(f"{save_rrd}: exists; name another file for --save-rrd")
-    from graphvio.cli.live_run import LiveOptions, run_live
+    from graphvio.cli.live_run import run_live
     from graphvio.mapping.process import MappingTask
 
     task = MappingTask(saved_map, out, view, web, save_rrd)
-    run_live(
-        LiveOptions(
-            source=source,
-            rig=rig,
-            config=config,
-            cameras=cameras,
-            no_pairs=no_pairs,
-            record=record,
-            png=png,
-            view=False,
-            health_port=health_port,
-            duration_s=duration,
-            forget_calibration=forget_calibration,
-            services=_WithMapping(ServiceOptions(port=0), ros2, task=task),
-        )
-    )
+    run_live(source, asked, _WithMapping(ServiceOptions(port=0), ros2, task=task))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import typer
 
 from graphvio.cli.output import lasting_streams
 from graphvio.cli.shared import EXIT_BAD_INPUT, warn
-from graphvio.errors import GraphvioError, MapError, ServiceError
+from graphvio.errors import GraphvioError, MapError, ServiceError, writing
 from graphvio.runtime import stop_signals_blocked
 
 if TYPE_CHECKING:
@@ -109,12 +109,10 @@ class SlamProcess:
         warn(message)
 
     def _write_path(self, out: Path) -> None:
-        try:
+        with writing(out, MapError, "the odometry's path is lost"):
             out.mkdir(parents=True, exist_ok=True)  # a SLAM that failed may not have
             for name in _PATHS:
                 (out / name).unlink(missing_ok=True)  # an earlier session's would be taken for this one's
-        except OSError as error:
-            raise MapError(f"{out}: cannot be written ({error}); the odometry's path is lost") from None
         self._path.write(out)
 
 

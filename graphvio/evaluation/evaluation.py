@@ -160,14 +160,12 @@ class Compared:
         return np.inf if self.evaluation is None else self.evaluation.ate_position_m.rmse
 
 
-def compare(
-    names: Sequence[str], results: Sequence[Trajectory], truth: Trajectory, max_gap_s: float = MAX_GAP_S
-) -> list[Compared]:
+def compare(names: Sequence[str], results: Sequence[Trajectory], truth: Trajectory) -> list[Compared]:
     """Evaluate several results against the same truth, see `evaluate`; one that fails does not affect the others."""
     compared: list[Compared] = []
     for name, result in zip(names, results, strict=True):
         try:
-            evaluation = evaluate(result, truth, max_gap_s)
+            evaluation = evaluate(result, truth)
         except TrajectoryError as error:
             compared.append(Compared(name, None, str(error), None))
             continue

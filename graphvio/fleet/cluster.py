@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from graphvio.config import Config
-from graphvio.errors import FleetError, GraphvioError, MissingExtraError
+from graphvio.errors import FleetError, GraphvioError, importing
 from graphvio.rig import Rig
 from graphvio.simulation import default_rig
 from graphvio.sources import open_source
@@ -24,10 +24,8 @@ _MAX_CONNECT_S = 20.0
 
 def distributed() -> Any:
     """Import and return the library ``distributed``."""
-    try:
+    with importing("dask", "fleet", "working on many sessions"):
         import distributed
-    except ImportError:
-        raise MissingExtraError("dask", "fleet", "working on many sessions") from None
     return distributed
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from graphvio.errors import FleetError, MissingExtraError
+from graphvio.errors import FleetError, MissingExtraError, importing
 from graphvio.optimization.workspace import digest
 
 _UNFINISHED = ".tmp"
@@ -23,10 +23,8 @@ def file_system(url: str) -> tuple[Any, str]:
         FleetError: if the kind of URL is unknown, or what it needs is not installed.
         MissingExtraError: if the extra ``fleet`` is not installed.
     """
-    try:
+    with importing("fsspec", "fleet", "working on many sessions"):
         from fsspec.core import url_to_fs
-    except ImportError:
-        raise MissingExtraError("fsspec", "fleet", "working on many sessions") from None
     try:
         files, path = url_to_fs(url)
     except (ImportError, ValueError) as error:

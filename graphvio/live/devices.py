@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Protocol
@@ -93,7 +93,13 @@ class Mailbox:
 
 
 class Device(Protocol):
-    """Interface of a device, whose methods are called by one thread at a time, but for `detail` and `counts`."""
+    """Interface of a device, whose methods are called by one thread at a time, but for `detail`.
+
+    Attributes:
+        counts: losses by kind.
+    """
+
+    counts: Counts
 
     @property
     def name(self) -> str:
@@ -129,9 +135,6 @@ class Device(Protocol):
 
     def detail(self) -> str:
         """Return one line for people: model, firmware, what is wrong."""
-
-    def counts(self) -> Mapping[str, int]:
-        """Return losses by kind."""
 
 
 class DeviceSource:
@@ -203,7 +206,7 @@ class DeviceSource:
         return partial(self._mailbox.put, device.name)
 
     def _health(self, device: Device) -> DeviceHealth:
-        counts = {**device.counts(), "device_lost": self._losses.totals().get(device.name, 0)}
+        counts = {**device.counts.totals(), "device_lost": self._losses.totals().get(device.name, 0)}
         counts["not_taken"] = self._mailbox.dropped(device.name)
         lost = self._lost.get(device.name)
         detail = device.detail() if lost is None else f"lost: {lost}"

@@ -35,7 +35,7 @@ class Meter:
         self._counts: Counter[str] = Counter()
         self._latencies_ms: deque[float] = deque(maxlen=_RECENT)
         self._histogram = np.zeros(_BINS + 1, dtype=np.int64)  # of the whole run
-        self._max_latency_ms = 0.0
+        self.max_latency_ms = 0.0  # of the whole run
         self._arrivals_ns: dict[str, deque[int]] = {}
 
     def count(self, kind: str, by: int = 1) -> None:
@@ -70,18 +70,13 @@ class Meter:
         with self._lock:
             self._latencies_ms.append(latency_ms)
             self._histogram[min(int(latency_ms / _BIN_MS), _BINS)] += 1
-            self._max_latency_ms = max(self._max_latency_ms, latency_ms)
+            self.max_latency_ms = max(self.max_latency_ms, latency_ms)
 
     @property
     def counts(self) -> dict[str, int]:
         """All counts by kind."""
         with self._lock:
             return dict(self._counts)
-
-    @property
-    def max_latency_ms(self) -> float:
-        """Maximum latency of the whole run."""
-        return self._max_latency_ms
 
     def recent_latency_ms(self, percent: float) -> float | None:
         """Return a percentile of the newest latencies."""
@@ -95,7 +90,7 @@ class Meter:
             if not total:
                 return None
             rank = np.searchsorted(np.cumsum(self._histogram), percent / 100.0 * total)
-            return self._max_latency_ms if rank >= _BINS else min(float((rank + 1) * _BIN_MS), self._max_latency_ms)
+            return self.max_latency_ms if rank >= _BINS else min(float((rank + 1) * _BIN_MS), self.max_latency_ms)
 
 
 def run_figures(meter: Meter, latest: Estimate | None, now_ns: int) -> Figures:

@@ -10,7 +10,7 @@ from socketserver import ThreadingMixIn
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from graphvio.errors import MissingExtraError, ServiceError
+from graphvio.errors import ServiceError, importing
 from graphvio.live.figures import STALE
 from graphvio.measurements.estimate import Status
 
@@ -46,10 +46,8 @@ class HealthServer:
     """
 
     def __init__(self, status: Callable[[], Figures], host: str = "127.0.0.1", port: int = 0) -> None:
-        try:
+        with importing("prometheus-client", "live", "metrics of a live run"):
             from prometheus_client import CollectorRegistry, make_wsgi_app
-        except ImportError:
-            raise MissingExtraError("prometheus-client", "live", "metrics of a live run") from None
         registry = CollectorRegistry(auto_describe=False)
         registry.register(_Collector(status))
         self._status = status

@@ -43,6 +43,7 @@ class LiveOdometry:
     Attributes:
         rig: of the source.
         config: of all stages.
+        odometry: whose `predict` may be called from any thread.
         estimates: of the framesets.
         predictions: at each IMU sample.
         events: of the run.
@@ -66,13 +67,13 @@ class LiveOdometry:
         self.config = config
         self._outputs = list(outputs)
         self._meter = Meter()
-        self._odometry = Odometry(rig, config, on_prediction=self.predictions.publish)
-        self._front_end = FrontEnd(self._odometry)
+        self.odometry = Odometry(rig, config, on_prediction=self.predictions.publish)
+        self._front_end = FrontEnd(self.odometry)
         if wants_keyframes:
             self._front_end.on_keyframe(self.keyframe_log.add)
         self._reception = Reception(source, rig, config, self._meter, self._report, self._deliver)
         self._estimation = Estimation(
-            self._odometry,
+            self.odometry,
             config.live,
             source.is_realtime,
             self._meter,
@@ -145,11 +146,6 @@ class LiveOdometry:
             elif time.monotonic() - since_s > _END_S:
                 return False
         return True
-
-    @property
-    def odometry(self) -> Odometry:
-        """The odometry, whose `predict` may be called from any thread."""
-        return self._odometry
 
     @property
     def is_healthy(self) -> bool:
@@ -237,7 +233,7 @@ class LiveOdometry:
         self._report(host_ns(), kind, detail)
 
     def _report_events(self) -> None:
-        for event in self._odometry.take_events():
+        for event in self.odometry.take_events():
             self._report(event.stamp_ns, event.kind, event.detail)
 
     def _fail(self, stage: Stage, error: BaseException) -> None:

@@ -37,7 +37,7 @@ class Stage:
         self._on_failure = on_failure
         self._at_end = at_end
         self._busy_since_s: float | None = None
-        self._done = 0
+        self.done = 0  # items or parts of work that have ended, one way or another
         self._thread = threading.Thread(target=self._run, name=f"graphvio-{name}", daemon=True)
 
     @contextmanager
@@ -48,7 +48,7 @@ class Stage:
             yield
         finally:
             self._busy_since_s = None
-            self._done += 1
+            self.done += 1
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -63,12 +63,7 @@ class Stage:
     def progress(self) -> None:
         """Mark inside of `working` that a part of the work is done, and the next one begins."""
         self._busy_since_s = time.monotonic()
-        self._done += 1
-
-    @property
-    def done(self) -> int:
-        """Number of items or parts of work that have ended, one way or another."""
-        return self._done
+        self.done += 1
 
     @property
     def busy_s(self) -> float:

@@ -21,7 +21,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
-from graphvio.errors import GraphvioError, MapError
+from graphvio.errors import GraphvioError, MapError, writing
 from graphvio.mapping.chains import Chains
 from graphvio.mapping.pose_graph import PoseGraph, TestedClosure
 from graphvio.mapping.recognition import Recognition
@@ -51,7 +51,7 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     """Write a map atomically; an older map is replaced, other files in the folder stay."""
     check_target(folder)
     folder = folder.resolve()  # what is replaced is a folder, not a link to it
-    try:
+    with writing(folder, MapError, "choose another place, or make room"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         try:
@@ -66,8 +66,6 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
                 made.replace(folder)
         finally:
             shutil.rmtree(made, ignore_errors=True)
-    except OSError as error:
-        raise MapError(f"{folder}: cannot be written ({error}); choose another place, or make room") from None
 
 
 def check_map(folder: Path) -> None:

@@ -9,16 +9,13 @@ import re
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.errors import OptimizationError
+from graphvio.errors import OptimizationError, writing
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.covisibility import verify_matches
 from graphvio.optimization.loops.closures import Place
@@ -35,19 +32,6 @@ _THREADS = 2
 _REFINEMENTS = 2  # COLMAP's default of 5 takes half as long again, and moves nothing by 0.001 px
 
 
-@dataclass(frozen=True, eq=False)
-class ColmapModel:
-    """A reconstruction on disk."""
-
-    folder: Path  # of the files
-    frame: int  # number of the optimisation's frame that is COLMAP's world
-    places: int  # number of framesets, COLMAP's frames
-    images: int  # number of images
-    points: int  # number of triangulated points
-    observations: int  # number over all points
-    reprojection_error_px: float  # mean over the observations; NaN without any
-
-
 def export(
     optimization: Optimization,
     sessions: Sequence[SessionInput],
@@ -55,8 +39,8 @@ def export(
     folder: Path,
     config: Config,
     on_progress: Progress = lambda *_: None,
-) -> list[ColmapModel]:
-    """Write images as ``images/SESSION/CAMERA/STAMP.png``, and the returned models as ``sparse/0``, ``sparse/1`` ...
+) -> None:
+    """Write images as ``images/SESSION/CAMERA/STAMP.png``, and models as ``sparse/0``, ``sparse/1`` and so on.
 
     Each frame of the optimisation becomes a model, as COLMAP does for unconnected ones; that with most places comes
     first. Models of an earlier export are removed.
@@ -79,22 +63,17 @@ def export(
         raise OptimizationError(
             f"{database.path}: holds no image of the sessions' places; extract their features first"
         )
-    try:
+    with writing(folder, OptimizationError, "is the disk full?"):
         _write_images(sessions, database, folder / "images", partial(on_progress, "images"))
         verify_matches(optimization, sessions, database, partial(on_progress, "matches"))
         for old in (folder / "sparse").glob("*"):
             if re.fullmatch(r"\d+", old.name):
                 shutil.rmtree(old)
-        models = []
-        for number, (frame, places) in enumerate(groups):
+        for number, places in enumerate(groups):
             target = folder / "sparse" / str(number)
             target.mkdir(parents=True)
-            model = _triangulated(_posed(optimization, sessions, places, database), database, folder, target, config)
-            models.append(_described(model, target, frame))
+            _triangulated(_posed(optimization, sessions, places, database), database, folder, target, config)
             on_progress("models", number + 1, len(groups))
-    except OSError as error:
-        raise OptimizationError(f"{folder}: cannot be written ({error}); is the disk full?") from None
-    return models
 
 
 def _names(session: SessionInput, place: Place, database: FeatureDatabase) -> list[str]:
@@ -105,14 +84,14 @@ def _names(session: SessionInput, place: Place, database: FeatureDatabase) -> li
 
 def _by_frame(
     optimization: Optimization, sessions: Sequence[SessionInput], database: FeatureDatabase
-) -> list[tuple[int, list[Place]]]:
+) -> list[list[Place]]:
     """Group places by frame, the frame with most places first."""
     groups: dict[int, list[Place]] = {}
     for optimized, session in zip(optimization.sessions, sessions, strict=True):
         for place in session.places:
             if _names(session, place, database):
                 groups.setdefault(int(optimized.frame[place.row]), []).append(place)
-    return sorted(groups.items(), key=lambda each: (-len(each[1]), each[0]))
+    return [groups[frame] for frame in sorted(groups, key=lambda frame: (-len(groups[frame]), frame))]
 
 
 def _write_images(
@@ -144,8 +123,8 @@ def _posed(
     return database.model(rigs)
 
 
-def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: Path, config: Config) -> Any:
-    """Triangulate the database's verified matches, with poses and cameras held fixed."""
+def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: Path, config: Config) -> None:
+    """Triangulate the database's verified matches and write the model, with poses and cameras held fixed."""
     library = colmap()
     options = library.IncrementalPipelineOptions()
     options.num_threads = 1  # with more, points depend on their timing
@@ -163,14 +142,3 @@ def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: P
         triangulated.write(target)
     except (RuntimeError, ValueError) as error:
         raise OptimizationError(f"{target}: COLMAP cannot triangulate the places' features ({error})") from None
-    return triangulated
-
-
-def _described(model: Any, folder: Path, frame: int) -> ColmapModel:
-    points = list(model.points3D.values())
-    lengths = np.array([point.track.length() for point in points], dtype=np.float64)
-    errors = np.array([point.error for point in points], dtype=np.float64)
-    mean = float(errors @ lengths / lengths.sum()) if points else float("nan")
-    return ColmapModel(
-        folder, frame, model.num_frames(), model.num_images(), len(points), int(lengths.sum()), mean
-    )  # fmt: skip

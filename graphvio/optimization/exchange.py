@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float
-from graphvio.errors import OptimizationError
+from graphvio.errors import OptimizationError, writing
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.graph import poses_of
 from graphvio.optimization.loops.colmap_library import colmap
@@ -69,12 +69,10 @@ def write_g2o(optimization: Optimization, path: Path) -> None:
         graph.add(gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.first_T_second), noise))
     unfinished = path.with_name(f".{path.name}.tmp")
     gtsam.writeG2o(graph, values, str(unfinished))
-    try:
+    with writing(path, OptimizationError, "choose another place"):
         if unfinished.read_bytes().count(b"EDGE") != graph.size():
             raise OSError(ENOSPC, os.strerror(ENOSPC))  # gtsam reports no error
         unfinished.replace(path)
-    except OSError as error:
-        raise OptimizationError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 def _odometry_edges(optimization: Optimization) -> Iterator[Edge]:

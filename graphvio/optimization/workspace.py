@@ -11,10 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from graphvio.errors import OptimizationError
+from graphvio.errors import OptimizationError, writing
 from graphvio.reporting.files import replace_file
 
 _STATE = "stages.json"
+_REMEDY = "choose another folder for results"
 
 
 class Workspace:
@@ -43,7 +44,7 @@ class Workspace:
                 )
             self._save()
         except OSError as error:
-            raise _cannot_write(folder, error) from None
+            raise OptimizationError(f"{folder}: cannot be written ({error.strerror or error}); {_REMEDY}") from None
         except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
             raise OptimizationError(f"{state}: is damaged; remove the folder or choose another one") from None
 
@@ -86,11 +87,9 @@ class Workspace:
     def write(self, name: str, data: bytes) -> None:
         """Write a file, which is whole or absent."""
         path = self.folder / name
-        try:
+        with writing(path, OptimizationError, _REMEDY):
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, data)
-        except OSError as error:
-            raise _cannot_write(path, error) from None
 
     def _continue(self, state: dict[str, Any]) -> None:
         known = state["inputs"]
@@ -116,9 +115,3 @@ class Workspace:
 def digest(*parts: str) -> str:
     """Return a short hash of texts."""
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
-
-
-def _cannot_write(where: Path, error: OSError) -> OptimizationError:
-    return OptimizationError(
-        f"{where}: cannot be written ({error.strerror or error}); choose another folder for results"
-    )

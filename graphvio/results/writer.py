@@ -22,7 +22,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import GraphvioError, TrajectoryError
+from graphvio.errors import GraphvioError, TrajectoryError, writing
 from graphvio.evaluation import Evaluation, evaluate
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
@@ -48,6 +48,7 @@ _CALIBRATION_HEADER = "stamp_ns,parameter,difference,sigma"
 _PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
 _NS_PER_S = 1e9
+_REMEDY = "choose another place for results"
 
 
 class _Comparison(NamedTuple):
@@ -77,7 +78,7 @@ class ResultWriter:
         Raises:
             GraphvioError: if it cannot be created.
         """
-        try:
+        with writing(base, GraphvioError, _REMEDY):
             base.mkdir(parents=True, exist_ok=True)
             number = 1
             while True:
@@ -87,8 +88,6 @@ class ResultWriter:
                     return folder
                 except FileExistsError:
                     number += 1
-        except OSError as error:
-            raise _cannot_write(base, error) from None
 
     def __init__(self, folder: Path, rig: Rig, config_yaml: str) -> None:
         self.folder = Path(folder)
@@ -132,7 +131,7 @@ class ResultWriter:
                     self._write(name, header)
         except OSError as error:
             self.close()
-            raise _cannot_write(self.folder, error) from None
+            raise GraphvioError(f"{self.folder}: cannot be written ({error.strerror or error}); {_REMEDY}") from None
 
     def __enter__(self) -> ResultWriter:
         return self
@@ -292,18 +291,14 @@ class ResultWriter:
 
     def _write(self, name: str, line: str) -> None:
         file = self._files[name]
-        try:
+        with writing(self.folder / name, GraphvioError, _REMEDY):
             file.write(line + "\n")
             file.flush()
-        except OSError as error:
-            raise _cannot_write(self.folder / name, error) from None
 
     def _write_at_once(self, name: str, text: str) -> None:
         """Write a file that is either complete or absent."""
-        try:
+        with writing(self.folder / name, GraphvioError, _REMEDY):
             replace_file(self.folder / name, text)
-        except OSError as error:
-            raise _cannot_write(self.folder / name, error) from None
 
 
 def covariance_row(stamp_ns: int, covariance: Float) -> str:
@@ -327,10 +322,6 @@ def _report_line(stamp_ns: int, name: str, report: PairReport) -> str:
 
 def _number(value: float) -> str:
     return f"{float(value):.9e}"
-
-
-def _cannot_write(where: Path, error: OSError) -> GraphvioError:
-    return GraphvioError(f"{where}: cannot be written ({error.strerror or error}); choose another place for results")
 
 
 def _compare_if_possible(trajectory: Trajectory, truth: Path | None) -> _Comparison:

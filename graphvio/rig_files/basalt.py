@@ -16,7 +16,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
-from graphvio.geometry import rotation_from_quat_wxyz, se3
+from graphvio.geometry import se3
 from graphvio.rig import Camera, Imu, Rig
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_text
@@ -33,7 +33,6 @@ _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """``camera_type`` -> graphvio's name, and the coefficients that the file has."""
 _NOISE = dict(zip(NOISE_KEYS, ("gyro_noise_std", "gyro_bias_std", "accel_noise_std", "accel_bias_std"), strict=True))
-_MAX_NORM_ERROR = 1e-3
 
 
 def is_calibration(path: Path) -> bool:
@@ -78,11 +77,7 @@ def _list(section: Section, key: str) -> list[Any]:
 
 def _camera(document: Section, lists: dict[str, list[Any]], i: int) -> Camera:
     section = document.nested(lists["intrinsics"][i], f"intrinsics[{i}]")
-    camera_type = section.text("camera_type")
-    if camera_type not in _MODELS:
-        raise RigError(
-            f"{section.where('camera_type')}: unknown model {camera_type!r}; use one of {', '.join(_MODELS)}"
-        )
+    camera_type = section.model("camera_type", _MODELS)
     model, names = _MODELS[camera_type]
     values = section.section("intrinsics")
     coefficients = [values.number(name) for name in names]
@@ -101,11 +96,7 @@ def _camera(document: Section, lists: dict[str, list[Any]], i: int) -> Camera:
 
 def _pose(section: Section) -> Float:
     quat_wxyz = np.array([section.number(f"q{axis}") for axis in "wxyz"])
-    norm = np.linalg.norm(quat_wxyz)
-    if abs(norm - 1.0) > _MAX_NORM_ERROR:
-        raise RigError(f"{section.where('qw')}: the quaternion's norm is {norm:.4g}; it must be 1")
-    rotation = rotation_from_quat_wxyz(quat_wxyz / norm)
-    return se3(rotation, np.array([section.number(f"p{axis}") for axis in "xyz"]))
+    return se3(section.rotation(quat_wxyz, "qw"), np.array([section.number(f"p{axis}") for axis in "xyz"]))
 
 
 def _imu(document: Section) -> Imu:

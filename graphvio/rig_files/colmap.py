@@ -16,7 +16,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.errors import RigError
-from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
+from graphvio.geometry import se3, se3_inverse
 from graphvio.rig import Camera, Rig
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import Section, named, read_text
@@ -37,7 +37,6 @@ _MODELS: dict[str, tuple[str, int, tuple[int, ...]]] = {  # graphvio's name, foc
     "EUCM": ("extended-unified", 2, (0, 1)),
 }
 _CENTRE_PX = 0.5
-_MAX_NORM_ERROR = 1e-3
 
 
 class _Lens(NamedTuple):
@@ -121,11 +120,8 @@ def _rig_T_cam(section: Section) -> Float:
     if section.values.get("ref_sensor"):
         return np.eye(4)
     quat_wxyz = section.array("cam_from_rig_rotation", (4,))
-    norm = float(np.linalg.norm(quat_wxyz))
-    if abs(norm - 1.0) > _MAX_NORM_ERROR:
-        raise RigError(f"{section.where('cam_from_rig_rotation')}: the quaternion's norm is {norm:.4g}; it must be 1")
-    cam_T_rig = se3(rotation_from_quat_wxyz(quat_wxyz / norm), section.array("cam_from_rig_translation", (3,)))
-    return se3_inverse(cam_T_rig)
+    rotation = section.rotation(quat_wxyz, "cam_from_rig_rotation")
+    return se3_inverse(se3(rotation, section.array("cam_from_rig_translation", (3,))))
 
 
 def _lenses(path: Path) -> dict[int, _Lens]:

@@ -214,11 +214,9 @@ def lens_of(section: Section, coefficients_key: str) -> Lens:
             f"radial-tangential (radtan) or equidistant (equi), or with one of {', '.join(SPHERES)}"
         )
     if camera_model == PINHOLE or section.values.get("distortion_model") is not None:
-        name = section.text("distortion_model")
+        name = section.model("distortion_model", _MODELS)
     else:
         name = "none"
-    if name not in _MODELS:
-        raise RigError(f"{section.where('distortion_model')}: unknown model {name!r}; use one of {', '.join(_MODELS)}")
     coefficients = np.zeros(0) if name == "none" else section.array(coefficients_key)
     if camera_model == PINHOLE:
         return Lens(_MODELS[name], section.array("intrinsics", (4,)), coefficients)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from graphvio.errors import RigError
+from graphvio.errors import RigError, reading
 from graphvio.rig import Rig
 from graphvio.rig_files import basalt, colmap, euroc, kalibr, kitti, native, orb_slam3, vins_fusion
 from graphvio.rig_files.reading import read_yaml
@@ -33,10 +33,8 @@ def load_rig(path: str | Path) -> Rig:
         RigError: if there is no such file, it cannot be read, or it does not describe a usable rig.
     """
     path = Path(path)
-    try:
+    with reading(path, RigError, "check the path"):
         return _load(path)
-    except OSError as error:
-        raise RigError(f"{path}: cannot be read ({error.strerror}); check the path") from None
 
 
 def _load(path: Path) -> Rig:

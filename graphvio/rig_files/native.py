@@ -13,7 +13,7 @@ from pathlib import Path
 
 from graphvio.calibration_sigmas import FACTORY, LEVELS, CalibrationSigmas
 from graphvio.cameras import COEFFICIENTS
-from graphvio.errors import RigError
+from graphvio.errors import RigError, writing
 from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair, as_written, checked_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_text
 
@@ -91,10 +91,8 @@ def save_rig(rig: Rig, path: str | Path) -> None:
         RigError: if the file cannot be written.
     """
     path = Path(path)
-    try:
+    with writing(path, RigError, "choose another place"):
         path.write_text(to_text(rig, path.parent), encoding="utf-8")
-    except OSError as error:
-        raise RigError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def to_text(rig: Rig, folder: Path) -> str:

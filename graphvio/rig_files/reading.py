@@ -14,10 +14,12 @@ import yaml
 
 from graphvio.arrays import Float
 from graphvio.errors import RigError
+from graphvio.geometry import rotation_from_quat_wxyz
 from graphvio.rig import Imu
 from graphvio.wording import nearest
 
 NOISE_KEYS = ("gyro_noise_density", "gyro_random_walk", "accel_noise_density", "accel_random_walk")
+_MAX_NORM_ERROR = 1e-3
 _DEFAULTS = {f.name: f.default for f in fields(Imu)}
 
 
@@ -66,6 +68,13 @@ class Section:
             raise RigError(f"{self.where(key)}: is {value}, which YAML makes of yes, on, no and off; put it in quotes")
         return str(value)
 
+    def model(self, key: str, known: Iterable[str]) -> str:
+        """Get a required name of a camera or distortion model that is one of those known."""
+        name = self.text(key)
+        if name not in known:
+            raise RigError(f"{self.where(key)}: unknown model {name!r}; use one of {', '.join(known)}")
+        return name
+
     def flag(self, key: str) -> bool:
         """Get true or false; false if it is not given."""
         value = self.values.get(key, False)
@@ -110,6 +119,13 @@ class Section:
         if isinstance(value, list) and len(value) == 16:
             return self.array(key, (16,)).reshape(4, 4)
         return self.array(key, (4, 4))
+
+    def rotation(self, quat_wxyz: Float, key: str) -> Float:
+        """Convert a quaternion (4,) of this mapping to a rotation (3, 3); ``key`` is its name in messages."""
+        norm = float(np.linalg.norm(quat_wxyz))
+        if abs(norm - 1.0) > _MAX_NORM_ERROR:
+            raise RigError(f"{self.where(key)}: the quaternion's norm is {norm:.4g}; it must be 1")
+        return rotation_from_quat_wxyz(quat_wxyz / norm)
 
     def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, Any]:
         """Get rate and noise densities of an IMU, whose keys are given by the names of `graphvio.rig.Imu`.

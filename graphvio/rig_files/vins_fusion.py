@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import RigError
 from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
@@ -50,10 +49,7 @@ def load(document: Section) -> Rig:
 
 def _camera(document: Section, i: int) -> Camera:
     section = read_yaml(document.file.parent / document.text(_CAMERA_KEY.format(i)))
-    model_type = section.text("model_type")
-    if model_type not in _LENSES:
-        raise RigError(f"{section.where('model_type')}: unknown model {model_type!r}; use one of {', '.join(_LENSES)}")
-    model, intrinsics, coefficients = _LENSES[model_type]
+    model, intrinsics, coefficients = _LENSES[section.model("model_type", _LENSES)]
     values = {key: value for name in _PARAMETERS for key, value in _mapping(section, name).items()}
     parameters = Section(values, section.file)
     where = f"body_T_cam{i}"

@@ -12,9 +12,8 @@ from graphvio.errors import RigError, SessionError
 from graphvio.rig import Rig
 from graphvio.ros2.node import Node, Publication, Reader
 from graphvio.ros2.wire import SENSOR_DATA, TF_STATIC_READER
-from graphvio.sessions import cdr
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
-from graphvio.sessions.rig_of_topics import info_topics, rig_of_topics, stereo_topics, transforms_in
+from graphvio.sessions.rig_of_topics import info_topics, rig_of_topics, stereo_topics, transforms_of
 from graphvio.sessions.topics import Place, Topic
 from graphvio.wording import listed
 
@@ -30,7 +29,7 @@ class _FirstMessages:
         self._data: list[bytes] = []
 
     def add(self, topic: str, type_name: str, data: bytes) -> None:
-        self.topics.setdefault(topic, Topic(topic, type_name, "cdr")).places.append(Place(-1, len(self._data)))
+        self.topics.setdefault(topic, Topic(topic, type_name)).places.append(Place(-1, len(self._data)))
         self._data.append(data)
 
     def read(self, place: Place) -> bytes:
@@ -80,13 +79,8 @@ def listen_for_rig(
 def listen_for_transforms(
     node: Node, published: list[Publication], wait: Callable[[float], bool]
 ) -> dict[tuple[str, str], Float]:
-    """Receive all static transforms; see `graphvio.sessions.rig_of_topics.transforms_in`."""
-    transforms: dict[tuple[str, str], Float] = {}
-    received = _receive(node, [], published, wait)
-    for topic in received.topics.values():
-        for place in topic.places:
-            transforms.update(transforms_in(cdr.decode(received.read(place), TRANSFORMS, received.path)))
-    return transforms
+    """Receive all static transforms; see `graphvio.sessions.rig_of_topics.transforms_of`."""
+    return transforms_of(_receive(node, [], published, wait))
 
 
 def _receive(

@@ -40,16 +40,14 @@ class Service:
         self._writer = Writer(
             node, f"{name}Reply", interfaces.response_type(service), PARAMETERS, prefix="rr", user_data=identity
         )
-        self.damaged = 0
 
     def take(self) -> None:
-        """Answer the requests received since the last call; damaged ones are counted in ``damaged``."""
+        """Answer the requests received since the last call; damaged ones are left out."""
         for data, writer in self.reader.take_with_writers():
             try:
                 header, request = split_header(data)
                 message = cdr.decode(request, self._request_type, self.reader.topic, interfaces.types())
             except SessionError:
-                self.damaged += 1
                 continue
             response = self._answer(message)
             self._wait_for_client(writer)

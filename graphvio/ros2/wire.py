@@ -6,17 +6,15 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from graphvio.errors import MissingExtraError
+from graphvio.errors import importing
 from graphvio.ros2 import interfaces
 from graphvio.sessions import cdr
 
 
 def require_dds() -> None:
     """Check that ``cyclonedds`` can be imported."""
-    try:
+    with importing("cyclonedds", "ros2", "ROS 2 topics"):
         import cyclonedds  # noqa: F401
-    except ImportError:
-        raise MissingExtraError("cyclonedds", "ros2", "ROS 2 topics") from None
 
 
 def dds_type_name(type_name: str) -> str:

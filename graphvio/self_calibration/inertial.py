@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.geometry import so3_exp, so3_log, so3_right_jacobian_inverse
+from graphvio.geometry import so3_log, so3_right_jacobian_inverse
 from graphvio.kernels import kernel, put
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, PARAMETERS, TIME_OFFSET, sensor_matrix
 from graphvio.self_calibration.preintegration import Preintegrated, covering_samples, integrate_samples
@@ -74,21 +74,6 @@ class InertialStates(NamedTuple):
     gravity: Float
     parameters: Float
 
-    def moved(self, step: Float) -> InertialStates:
-        """Return the states after a step (9 K + 28,) ``[poses, velocities, gravity, parameters]``."""
-        n = len(self.poses)
-        poses = self.poses.copy()
-        for pose, of_pose in zip(poses, step[: POSE * n].reshape(n, POSE), strict=True):
-            pose[:3, 3] += pose[:3, :3] @ of_pose[3:]
-            pose[:3, :3] = pose[:3, :3] @ so3_exp(of_pose[:3].copy())
-        velocities, gravity, parameters = np.split(step[POSE * n :], [VELOCITY * n, VELOCITY * n + GRAVITY])
-        return InertialStates(
-            poses,
-            self.velocities + velocities.reshape(n, VELOCITY),
-            self.gravity + gravity,
-            self.parameters + parameters,
-        )
-
 
 class InertialEquations(NamedTuple):
     """Normal equations of a window's inertial errors; a step is ``-solve(hessian, gradient)``.
@@ -105,11 +90,6 @@ class InertialEquations(NamedTuple):
     gradient: Float
     cost: float
     errors2: Float
-
-    @property
-    def skipped(self) -> int:
-        """Number of intervals that the samples do not cover."""
-        return int(np.isnan(self.errors2).sum())
 
 
 @kernel

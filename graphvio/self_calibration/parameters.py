@@ -19,7 +19,7 @@ from graphvio.cameras import COEFFICIENTS, N_ESTIMATED
 from graphvio.geometry import skew, so3_exp
 from graphvio.rig import Camera, Rig, SingleCamera, StereoPair
 
-INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, N_ESTIMATED, 3, 3
+INTRINSICS, DISTORTION, ROTATION = 4, N_ESTIMATED, 3
 CAMERA = INTRINSICS + DISTORTION
 LEFT, RIGHT, STEREO, BODY = 0, CAMERA, 2 * CAMERA, 2 * CAMERA + 6
 PAIR = BODY + 6

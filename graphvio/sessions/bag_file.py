@@ -7,16 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from graphvio.errors import MissingExtraError, SessionError
+from graphvio.errors import SessionError, importing
 from graphvio.sessions import cdr, ros1
 from graphvio.sessions.messages import STAMPED
 from graphvio.sessions.topics import Place, Store, Topic
 
-try:
+with importing("rosbags", "sessions", "reading a bag"):
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
-except ImportError:
-    raise MissingExtraError("rosbags", "sessions", "reading a bag") from None
 
 
 class BagFile(Store):
@@ -65,7 +63,7 @@ class BagFile(Store):
         numbers = {id(each): number for number, each in enumerate(self._connections)}
         rows = [0] * len(self._connections)
         for each in self._connections:
-            self.topics.setdefault(each.topic, Topic(each.topic, each.msgtype, "cdr"))
+            self.topics.setdefault(each.topic, Topic(each.topic, each.msgtype))
         if not self._connections:
             return
         for connection, logged_ns, data in self._reader.messages(self._connections):

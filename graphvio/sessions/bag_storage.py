@@ -9,15 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from graphvio.errors import MissingExtraError
+from graphvio.errors import importing
 from graphvio.sessions import cdr, ros1
 from graphvio.sessions.storage import exists_error, not_writable_error
 
-try:
+with importing("rosbags", "sessions", "writing a bag"):
     from rosbags import rosbag1, rosbag2
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-except ImportError:
-    raise MissingExtraError("rosbags", "sessions", "writing a bag") from None
 
 _ROS2_VERSION: Final = 8  # of metadata.yaml; the newest whose QoS profiles older distributions read, too
 _FOREVER = QosTime(9223372036, 854775807)  # as ROS writes it

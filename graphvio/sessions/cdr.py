@@ -5,15 +5,13 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from graphvio.errors import MissingExtraError, SessionError
+from graphvio.errors import SessionError, importing
 
 
 def typestore(name: str) -> Any:
     """Return the types of a ROS distribution, by its name in rosbags' ``Stores``."""
-    try:
+    with importing("rosbags", "sessions", "reading or writing a session"):
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise MissingExtraError("rosbags", "sessions", "reading or writing a session") from None
     return get_typestore(Stores[name])
 
 

@@ -15,17 +15,15 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from graphvio.errors import MissingExtraError, SessionError
+from graphvio.errors import SessionError, importing, reading
 from graphvio.sessions.topics import Place, Store, Topic
 
-try:
+with importing("mcap", "sessions", "reading a session"):
     from mcap.exceptions import McapError
     from mcap.opcode import Opcode
     from mcap.records import Attachment, Channel, Header, MessageIndex, Schema
     from mcap.stream_reader import StreamReader, get_chunk_data_stream
     from mcap.writer import MCAP0_MAGIC
-except ImportError:
-    raise MissingExtraError("mcap", "sessions", "reading a session") from None
 
 _PREFIX = struct.Struct("<BQ")  # opcode and length of a record
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, times of recording and publishing
@@ -54,12 +52,10 @@ class McapFile(Store):
         self._chunks: OrderedDict[int, bytes] = OrderedDict()
         self._damaged_chunks: dict[int, str] = {}
         self._lock = threading.Lock()
-        try:
+        with reading(path, SessionError, "check the path"):
             self._file: BinaryIO = path.open("rb")
             self._size = path.stat().st_size
             self._scan()
-        except OSError as error:
-            raise SessionError(f"{path}: cannot be read ({error.strerror}); check the path") from None
 
     def read(self, place: Place) -> bytes:
         """Return a message."""
@@ -137,7 +133,7 @@ class McapFile(Store):
             self._schemas[record.id] = record.name
         elif isinstance(record, Channel):
             type_name = self._schemas.get(record.schema_id, "")
-            topic = Topic(record.topic, type_name, record.message_encoding)
+            topic = Topic(record.topic, type_name)
             self._channels[record.id] = self.topics.setdefault(record.topic, topic)
         elif isinstance(record, Attachment):
             self.attachments[record.name] = record.data

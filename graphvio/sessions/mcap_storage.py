@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from graphvio.errors import MissingExtraError
+from graphvio.errors import importing
 from graphvio.sessions import cdr
 from graphvio.sessions.storage import exists_error, not_writable_error
 from graphvio.version import __version__
@@ -84,8 +84,6 @@ class McapStorage:
 
 
 def _writer_class() -> Any:
-    try:
+    with importing("mcap", "sessions", "reading or writing a session"):
         from mcap.writer import CompressionType, Writer
-    except ImportError:
-        raise MissingExtraError("mcap", "sessions", "reading or writing a session") from None
     return lambda file: Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4)

@@ -34,7 +34,7 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
         SessionError: if a message is damaged.
     """
     images = [each.name for each in of_type(messages.topics, IMAGE, COMPRESSED)]
-    transforms = _transforms(messages)
+    transforms = transforms_of(messages)
     imu = next(iter(of_type(messages.topics, IMU)), None)
     found = []
     for pair, (left, right) in stereo_topics(images).items():
@@ -141,8 +141,8 @@ def _frame(info: Any, topic: str) -> str:
     return str(info.header.frame_id) or topic
 
 
-def _transforms(messages: MessageReader) -> dict[tuple[str, str], Float]:
-    """All static transforms: see `transforms_in`."""
+def transforms_of(messages: MessageReader) -> dict[tuple[str, str], Float]:
+    """Return all static transforms: see `transforms_in`."""
     made: dict[tuple[str, str], Float] = {}
     for topic in messages.topics.values():
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):

@@ -37,7 +37,6 @@ class Topic:
 
     name: str  # such as ``/imu``
     type_name: str  # such as ``sensor_msgs/msg/Imu``
-    encoding: str  # of its messages, ``cdr`` for ROS 2
     logged_ns: list[int] = field(default_factory=list)  # time of recording of each message
     places: list[Place] = field(default_factory=list)  # position of each message
     # stamps of their headers if the reader decodes them, otherwise empty

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float, Image
-from graphvio.errors import SourceError
+from graphvio.errors import SourceError, writing
 from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
@@ -191,10 +191,8 @@ def _in_order(
 
 
 def _write_image(path: Path, image: Image) -> None:
-    try:
+    with writing(path, SourceError, "is the disk full?"):
         euroc_layout.write_image(path, image)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be written ({error.strerror}); is the disk full?") from None
 
 
 def _write_sensors(simulator: Simulator, rig: Rig, mav0: Path) -> None:

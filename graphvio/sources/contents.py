@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphvio.errors import RigError, SourceError
+from graphvio.errors import RigError, SourceError, reading
 from graphvio.image_decoding import ImageError
 from graphvio.measurements.events import EventKind
 from graphvio.rig import Camera, Rig
@@ -57,10 +57,8 @@ def describe_folder(path: Path, rig: Path | None = None) -> FolderDescription:
         RigError: if the calibration is not usable, is of images of another size, or there is none.
     """
     used = None if rig is None else load_rig(rig)
-    try:
+    with reading(path, SourceError, "check its permissions"):
         return _described(path, used)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
 def _described(path: Path, rig: Rig | None) -> FolderDescription:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from graphvio.errors import RigError, SourceError
+from graphvio.errors import RigError, SourceError, reading
 from graphvio.rig import Rig
 from graphvio.rig_files import find_rig
 from graphvio.sessions.store import is_store, open_store
@@ -64,12 +64,10 @@ def open_source(
             f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: images that are triggered together"
         )
     path = Path(path)
-    try:
+    with reading(path, SourceError, "check its permissions"):
         index, rig, faults = read_index(path, rig, topics or {})
         tolerance_ns = None if tolerance_ms is None else round(1e6 * tolerance_ms)
         return Source(index, rig, faults, from_s, to_s, tolerance_ns)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
 def read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[Index, Rig, FaultLog]:
@@ -103,13 +101,11 @@ def recorded_rig(path: Path) -> Rig:
         MissingExtraError: if it is a session or bag, and the extra ``sessions`` is not installed.
     """
     _check_exists(path)
-    try:
+    with reading(path, SourceError, "check its permissions"):
         if is_store(path):
             return _required(session.rig_in(open_store(path)), path)
         layout_of(path)
         return _required(find_rig(path), path)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
 def _check_exists(path: Path) -> None:

@@ -12,16 +12,14 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def read_ahead(
-    work: Callable[[T], R], items: Iterable[T], depth: int = 8, threads: int = 2
-) -> Generator[R, None, None]:
-    """Yield ``map(work, items)``, with results prepared ahead in threads.
+def read_ahead(work: Callable[[T], R], items: Iterable[T], depth: int = 8) -> Generator[R, None, None]:
+    """Yield ``map(work, items)``, with results prepared ahead in two threads.
 
     The items are made in the calling thread, ``depth`` at most before their results are taken. An exception of ``work``
     is raised where its result is due. The threads end when the iterator is exhausted, closed or collected.
     """
     waiting: deque[Future[R]] = deque()
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="graphvio-read")
+    pool = ThreadPoolExecutor(2, thread_name_prefix="graphvio-read")
     try:
         source = iter(items)
         for item in islice(source, depth):

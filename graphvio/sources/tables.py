@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.errors import SourceError
+from graphvio.errors import SourceError, reading
 from graphvio.measurements.events import EventKind
 from graphvio.sources.faults import FaultLog
 
@@ -285,10 +285,8 @@ def _cells(line: str) -> list[str]:
 
 def read_lines(path: Path) -> list[str]:
     """Read the lines of a text file with any line ends; bytes that are no text spoil only their line."""
-    try:
+    with reading(path, SourceError, "check the recording"):
         return path.read_text(encoding="utf-8-sig", errors="replace").split("\n")
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror}); check the recording") from None
 
 
 def _is_number(text: str) -> bool:

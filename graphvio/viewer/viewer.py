@@ -53,7 +53,7 @@ class Viewer:
         self._extras: deque[Callable[[Recording], None]] = deque()
         self._frameset: tuple[FrameSet, Estimate] | None = None
         self._closing = False
-        self._dropped = 0
+        self.dropped = 0  # framesets whose images were left out because the odometry was faster
         self._error: Exception | None = None
         self._worker = threading.Thread(target=self._work, args=(recording,), name="viewer", daemon=True)
         self._worker.start()
@@ -73,11 +73,6 @@ class Viewer:
         """Address for a browser, or None if none is served."""
         return None if self._web is None else self._web.url
 
-    @property
-    def dropped(self) -> int:
-        """Number of framesets whose images were left out because the odometry was faster."""
-        return self._dropped
-
     def show(self, frameset: FrameSet | None, estimate: Estimate) -> None:
         """Show an estimate, and the images of its frameset unless that is None; returns at once."""
         with self._changed:
@@ -85,7 +80,7 @@ class Viewer:
                 return
             self._estimates.append(estimate)
             if frameset is not None:
-                self._dropped += self._frameset is not None
+                self.dropped += self._frameset is not None
                 self._frameset = (frameset, estimate)
             self._changed.notify()
 

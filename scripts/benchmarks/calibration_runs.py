@@ -10,6 +10,7 @@ from time import perf_counter
 
 import numpy as np
 
+from benchmarks.calibration_differences import calibration_differences
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
@@ -20,7 +21,7 @@ from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.simulation import RIG_CHANGES, make_simulator
-from graphvio.simulation.calibration_error import CalibrationErrorSizes, calibration_differences, draw
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.sources import open_source
 from graphvio.sources.sequencer import merge
 from graphvio.trajectory import Trajectory

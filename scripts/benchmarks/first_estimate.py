@@ -21,7 +21,8 @@ def main() -> None:
         now_s = perf_counter()
         laps[name], last_s = now_s - last_s, now_s
 
-    from graphvio.cli.shared import open_recording, reading_of
+    from graphvio.cli.options import ReadingOptions
+    from graphvio.cli.shared import open_recording
     from graphvio.config import Config
     from graphvio.odometry import Odometry
     from graphvio.pipeline import run  # noqa: F401 - the command imports it
@@ -32,7 +33,7 @@ def main() -> None:
     lap("import")
     path, pairs, imu = sys.argv[1:]
     config = Config()
-    recording = open_recording(Path(path), None, config, reading_of(pairs=pairs, no_imu=imu == "no"))
+    recording = open_recording(Path(path), ReadingOptions(pairs=pairs, no_imu=imu == "no"), config)
     lap("open")
     set_up_threads()
     warm_up(recording.rig, config, wait_for_calibration=False)

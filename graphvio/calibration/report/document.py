@@ -11,7 +11,7 @@ from graphvio.arrays import Bool, Float
 from graphvio.calibration.imu_alignment import ImuAlignment
 from graphvio.calibration.pair_calibration import PairCalibration
 from graphvio.calibration.result import Calibration, Clock, RigComparison
-from graphvio.errors import CalibrationError
+from graphvio.errors import CalibrationError, writing
 
 VERSION = 1
 
@@ -64,10 +64,8 @@ def write_document(found: Calibration, path: Path) -> None:
     )
     text += "# [rotation, translation] in b.\n"
     text += yaml.safe_dump(document(found), sort_keys=False, width=110, default_flow_style=None)
-    try:
+    with writing(path, CalibrationError, "choose another place"):
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def _two(found: Calibration, i: int, j: int) -> dict[str, Any]:

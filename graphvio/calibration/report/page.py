@@ -12,7 +12,7 @@ from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
 from graphvio.calibration.report import figures
 from graphvio.calibration.report.document import write_document
 from graphvio.calibration.result import Calibration
-from graphvio.errors import CalibrationError
+from graphvio.errors import CalibrationError, writing
 from graphvio.reporting.figures import png
 from graphvio.reporting.html import render
 
@@ -33,14 +33,12 @@ def write_report(found: Calibration, folder: Path, source: str, count: int) -> P
     """
     unit = "framesets" if found.rig is not None else "poses"
     pictures = {pair: _pictures(each, count, unit) for pair, each in found.places.pairwise.items()}
-    try:
+    with writing(folder, CalibrationError, "choose another place"):
         folder.mkdir(parents=True, exist_ok=True)
         for (i, j), named in pictures.items():
             for name, data in named.items():
                 (folder / f"{name}-{i}-{j}.png").write_bytes(data)
         (folder / PAGE).write_text(page(found, pictures, source), encoding="utf-8")
-    except OSError as error:
-        raise CalibrationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
     write_document(found, folder / NUMBERS)
     return folder / PAGE
 

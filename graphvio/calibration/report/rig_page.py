@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphvio.errors import CalibrationError
+from graphvio.errors import CalibrationError, writing
 from graphvio.odometry.recorded_calibration import HalfComparison, RecordedCalibration
 from graphvio.reporting.html import render
 from graphvio.results.calibration_plot import CalibrationHistory
@@ -58,7 +58,7 @@ def write_rig_report(found: RecordedCalibration, folder: Path, source: str) -> P
     history = CalibrationHistory()
     for stamp_ns, estimate in found.batch.history:
         history.add(stamp_ns, estimate)
-    try:
+    with writing(folder, CalibrationError, "choose another place"):
         folder.mkdir(parents=True, exist_ok=True)
         history.plot(folder / PICTURE, found.end_ns, source)
         text = render(
@@ -75,8 +75,6 @@ def write_rig_report(found: RecordedCalibration, folder: Path, source: str) -> P
         )
         (folder / PAGE).write_text(text, encoding="utf-8")
         (folder / RIG).write_text(to_text(found.rig, folder), encoding="utf-8")
-    except OSError as error:
-        raise CalibrationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
     return folder / PAGE
 
 

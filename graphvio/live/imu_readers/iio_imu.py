@@ -6,7 +6,6 @@ import os
 import re
 import select
 import threading
-from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,11 +50,11 @@ class IioImu:
         self._names, self._rate_hz, self._sysfs, self._dev = names, rate_hz, sysfs, dev
         self._buffers: list[_Buffer] = []
         self._merging: AccelOntoGyro | None = None
-        self._counts = Counts()
+        self.counts = Counts()
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
-        self._merging = AccelOntoGyro(hand_over, self._counts)
+        self._merging = AccelOntoGyro(hand_over, self.counts)
         try:
             for name in self._names:
                 self._buffers.append(_Buffer(_find(self._sysfs, name), self._dev, self._rate_hz))
@@ -95,10 +94,6 @@ class IioImu:
     def detail(self) -> str:
         """See `Device.detail`."""
         return "IMU of the kernel"
-
-    def counts(self) -> Mapping[str, int]:
-        """See `Device.counts`."""
-        return self._counts.totals()
 
 
 class _Buffer:

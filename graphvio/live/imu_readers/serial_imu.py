@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Mapping
 from functools import reduce
 from operator import xor
 from typing import Any
 
 import numpy as np
 
-from graphvio.errors import MissingExtraError, SourceError
+from graphvio.errors import SourceError, importing
 from graphvio.live.device_clock import MicrosecondCounter
 from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.measurements.events import EventKind
@@ -114,21 +113,19 @@ class SerialImu:
     """
 
     def __init__(self, path: str, baud: int) -> None:
-        try:
+        with importing("pyserial", "live", "an IMU on a serial port"):
             import serial
-        except ImportError:
-            raise MissingExtraError("pyserial", "live", "an IMU on a serial port") from None
         self._library = serial
         self.name = f"serial:{path}"
         self.clock = self.name
         self._path, self._baud = path, baud
         self._port: Any = None
-        self._counts = Counts()
-        self._lines = ImuLines(self.clock, self._counts)
+        self.counts = Counts()
+        self._lines = ImuLines(self.clock, self.counts)
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
-        self._lines = ImuLines(self.clock, self._counts)
+        self._lines = ImuLines(self.clock, self.counts)
         try:
             self._port = self._library.Serial(self._path, self._baud, timeout=_POLL_S, exclusive=True)
             self._port.reset_input_buffer()  # arrival times of buffered data are meaningless
@@ -161,7 +158,3 @@ class SerialImu:
     def detail(self) -> str:
         """See `Device.detail`."""
         return f"IMU, lines at {self._baud} baud"
-
-    def counts(self) -> Mapping[str, int]:
-        """See `Device.counts`."""
-        return self._counts.totals()

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import MissingExtraError, RigError, SourceError
+from graphvio.errors import RigError, SourceError, importing
 from graphvio.geometry import se3_inverse
 from graphvio.live.devices import HandOver
 from graphvio.live.lens_fit import FittedLens, fit_rational
@@ -324,8 +324,6 @@ def _ns(since_boot: timedelta) -> int:
 
 def _library() -> Any:
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # else it warns where no camera is connected
-    try:
+    with importing("depthai", "oak", "an OAK camera"):
         import depthai
-    except ImportError:
-        raise MissingExtraError("depthai", "oak", "an OAK camera") from None
     return depthai

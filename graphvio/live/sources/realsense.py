@@ -197,7 +197,7 @@ class RealSenseDevice(StereoCamera):
     def detail(self) -> str:
         """See `Device.detail`."""
         host_stamps = "; no hardware stamps: librealsense's kernel patch or its RSUSB build is needed"
-        return self._detail + (host_stamps if "host_stamp" in self._counts.totals() else "")
+        return self._detail + (host_stamps if "host_stamp" in self.counts.totals() else "")
 
     def _is_gone(self) -> bool:
         return self._removed.is_set()
@@ -270,7 +270,7 @@ class RealSenseDevice(StereoCamera):
 
         stamp_ms = frame.get_timestamp()
         if frame.get_frame_timestamp_domain() != rs.timestamp_domain.hardware_clock:
-            self._counts.add("host_stamp")
+            self.counts.add("host_stamp")
             return host_ns_of_realtime(round(1e6 * stamp_ms)), None
         # The stamp is when the readout begins; the driver also reports the middle of the exposure.
         readout, middle = rs.frame_metadata_value.frame_timestamp, rs.frame_metadata_value.sensor_timestamp

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -34,7 +34,7 @@ class StereoCamera(ABC):
         self.name = f"{kind}:{device_id}"
         self.clock = device_id
         self._cameras = cameras
-        self._counts = Counts()
+        self.counts = Counts()
         self._numbers: dict[int, int] = {}  # of the newest image of each side
         self._newest_ns = 0
         self._merging: AccelOntoGyro | None = None
@@ -48,10 +48,6 @@ class StereoCamera(ABC):
                 raise DeviceLostError("unplugged, or it has crashed")
             if host_ns() - self._newest_ns > _MAX_SILENCE_NS:
                 raise DeviceLostError("no image for 5 s")
-
-    def counts(self) -> Mapping[str, int]:
-        """See `Device.counts`."""
-        return self._counts.totals()
 
     def factory_rig(self) -> Rig:
         """Return the factory's calibration of the camera, once it is started.
@@ -81,7 +77,7 @@ class StereoCamera(ABC):
 
     def _reset(self, hand_over: HandOver) -> None:
         self._numbers = {}
-        self._merging = AccelOntoGyro(hand_over, self._counts)
+        self._merging = AccelOntoGyro(hand_over, self.counts)
 
     def _calibrate(self, read: Callable[[], Rig]) -> None:
         """Read the factory's calibration; an error matters only if no rig is given."""
@@ -97,12 +93,12 @@ class StereoCamera(ABC):
             try:
                 on_message(message)
             except Exception:
-                self._counts.add(kind)
+                self.counts.add(kind)
 
         return guarded
 
     def _count_lost(self, side: int, number: int) -> None:
-        self._counts.add("frames_lost", max(number - self._numbers.get(side, number - 1) - 1, 0))
+        self.counts.add("frames_lost", max(number - self._numbers.get(side, number - 1) - 1, 0))
         self._numbers[side] = number
 
 

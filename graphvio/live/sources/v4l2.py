@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -224,7 +224,7 @@ class V4l2Camera:
         self.name = path
         self._parts, self._settings, self._open_capture = tuple(parts), settings, open_capture
         self._capture: Capture | None = None
-        self._counts = Counts()
+        self.counts = Counts()
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
@@ -239,11 +239,11 @@ class V4l2Camera:
             arrival_ns = host_ns()
             stamp_ns = stamp_of(self._capture)
             if stamp_ns is None:
-                self._counts.add("no_kernel_stamp")
+                self.counts.add("no_kernel_stamp")
                 stamp_ns = arrival_ns
             is_there, raw = self._capture.retrieve()
             if not is_there:
-                self._counts.add("no_image")
+                self.counts.add("no_image")
                 continue
             image = GreyImage(raw, self._settings.pixel_format, self._settings.size_px, self.name)
             for camera, rows, columns in self._parts:
@@ -258,14 +258,10 @@ class V4l2Camera:
     def detail(self) -> str:
         """See `Device.detail`."""
         width, height = self._settings.size_px
-        stamps = "; its driver does not stamp, arrivals are used" if "no_kernel_stamp" in self._counts.totals() else ""
+        stamps = "; its driver does not stamp, arrivals are used" if "no_kernel_stamp" in self.counts.totals() else ""
         return (
             f"{', '.join(name for name, _, _ in self._parts)}, {width}x{height} {self._settings.pixel_format}{stamps}"
         )
-
-    def counts(self) -> Mapping[str, int]:
-        """See `Device.counts`."""
-        return self._counts.totals()
 
 
 def list_devices(nodes: Path = _NODES, by_id: Path = _BY_ID) -> Sequence[DeviceInfo]:

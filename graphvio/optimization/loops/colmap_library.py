@@ -6,7 +6,7 @@ import signal
 import threading
 from typing import Any
 
-from graphvio.errors import MissingExtraError, OptimizationError
+from graphvio.errors import OptimizationError, importing
 from graphvio.runtime import has_mixed_zlib
 
 CENTRE_PX = 0.5
@@ -20,10 +20,8 @@ def colmap() -> Any:
         OptimizationError: if it was imported in an order that corrupts memory.
         MissingExtraError: if the extra ``maps`` is not installed.
     """
-    try:
+    with importing("pycolmap", "maps", "loop closure and maps"):
         import pycolmap
-    except ImportError:
-        raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
     if has_mixed_zlib():
         raise OptimizationError("pycolmap was imported before zlib, by which Python crashes; import graphvio before it")
     if threading.current_thread() is threading.main_thread():  # glog would print a stack at SIGTERM

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import OptimizationError
+from graphvio.errors import OptimizationError, writing
 from graphvio.optimization.loops.closures import Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization
 from graphvio.optimization.report import figures
@@ -29,8 +29,8 @@ VERSION = 1
 _MAX_MAPS = 6
 
 
-def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory | None]) -> Path:
-    """Write all numbers as JSON, and the page with its figures, whose path is returned; each file is whole or absent.
+def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory | None]) -> None:
+    """Write all numbers as JSON, and the page with its figures; each file is whole or absent.
 
     Args:
         found: the optimisation.
@@ -48,28 +48,22 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
         "moved": png(figures.plot_moved(found, numbers)),
         "sigmas": png(figures.plot_sigmas(found, numbers)),
     }
-    try:
+    with writing(folder, OptimizationError, "choose another place"):
         folder.mkdir(parents=True, exist_ok=True)
         replace_file(folder / SUMMARY, summary)
         replace_file(folder / PAGE, page(found, numbers, maps, pictures))
-    except OSError as error:
-        raise OptimizationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
-    return folder / PAGE
 
 
-def write_plan(found: Optimization, folder: Path, points: Float | None) -> Path:
-    """Write a picture of the frame with most framesets from above, with points (N, 3) of its map; return its path.
+def write_plan(found: Optimization, folder: Path, points: Float | None) -> None:
+    """Write a picture of the frame with most framesets from above, with points (N, 3) of its map.
 
     Raises:
         OptimizationError: if the folder cannot be written.
     """
     numbers = numbers_of(found, [None] * len(found.sessions), folder)
     plan = png(figures.plot_plan(found, numbers, _largest_frames(numbers)[0], points))
-    try:
+    with writing(folder, OptimizationError, "choose another place"):
         replace_file(folder / PLAN, plan)
-    except OSError as error:
-        raise OptimizationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
-    return folder / PLAN
 
 
 def _largest_frames(numbers: Numbers) -> list[int]:

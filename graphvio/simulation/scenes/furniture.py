@@ -43,9 +43,9 @@ def chair(world: World, x: float, y: float, yaw: float) -> None:
         world.box((x + c * a - s * b, y + s * a + c * b, 0.0), (0.04, 0.04, 0.42), "wood", yaw)
 
 
-def bookcase(world: World, x: float, y: float, yaw: float, width: float = 1.2, height: float = 2.0) -> None:
+def bookcase(world: World, x: float, y: float, yaw: float, width: float = 1.2) -> None:
     """Add a bookcase that faces along yaw."""
-    world.box((x, y, 0.0), (0.35, width, height), "wood", yaw, front="books")
+    world.box((x, y, 0.0), (0.35, width, 2.0), "wood", yaw, front="books")
 
 
 def sofa(world: World, x: float, y: float, yaw: float) -> None:
