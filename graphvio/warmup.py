@@ -28,18 +28,18 @@ from graphvio.backend.propagation import Propagator
 from graphvio.backend.states import RigState
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
-from graphvio.frontend.cost import camera_motions
-from graphvio.frontend.depth_errors import by_depth_errors
-from graphvio.frontend.depth_scale import with_unknown_scales
-from graphvio.frontend.extrinsic_monitor import warm_up_extrinsic_monitor
-from graphvio.frontend.motion_slants import warm_up_motion_slants
-from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
-from graphvio.frontend.observations import Observations, RigArrays, correspond
-from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
-from graphvio.frontend.selection import best_pair_motion, searched_and_refined
+from graphvio.frontend.depth.motion_slants import warm_up_motion_slants
+from graphvio.frontend.depth.motion_stereo import FirstSights, MotionHistory
+from graphvio.frontend.depth.tracks import common_rows
+from graphvio.frontend.motion.cost import camera_motions
+from graphvio.frontend.motion.depth_errors import by_depth_errors
+from graphvio.frontend.motion.depth_scale import with_unknown_scales
+from graphvio.frontend.motion.observations import Observations, RigArrays, correspond
+from graphvio.frontend.motion.selection import best_pair_motion, searched_and_refined
+from graphvio.frontend.pairs.extrinsic_monitor import warm_up_extrinsic_monitor
 from graphvio.frontend.singles import SinglesFrontend
-from graphvio.frontend.tracker import GroupTracker
-from graphvio.frontend.tracks import common_rows
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, pixels_at_lines
+from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
 from graphvio.kernel_cache import any_compiled_before, cache_root
 from graphvio.kernels import announce_compilation, await_compilers, compile_elsewhere, is_compiling_elsewhere
@@ -53,8 +53,8 @@ from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
 _CALIBRATION = "graphvio.self_calibration.bundle"
-_COMPILED_LAST = ("graphvio.frontend.lucas_kanade", "graphvio.backend.propagation")
-_MOTION, _WINDOW = "graphvio.frontend.refinement", "graphvio.self_calibration.moving_landmarks"
+_COMPILED_LAST = ("graphvio.frontend.imaging.lucas_kanade", "graphvio.backend.propagation")
+_MOTION, _WINDOW = "graphvio.frontend.motion.refinement", "graphvio.self_calibration.moving_landmarks"
 _OTHER_PROCESS = "import sys; from graphvio.warmup import compile_for_another; compile_for_another(sys.argv[1])"
 _PARTS = ("tracking", "motion")
 _IS_COMPILED = b"."  # what a process writes when it has what a first pose needs

@@ -17,10 +17,10 @@ from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import InitialUncertainty, RigState
 from graphvio.config.stages import MotionConfig, SmootherConfig
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import searched_and_refined
-from graphvio.frontend.stereo import triangulate
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import Refined
+from graphvio.frontend.motion.selection import searched_and_refined
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Rig, StereoPair

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from graphvio.arrays import AnyArray, Float
 from graphvio.backend.inertial import ImuBuffer
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.stereo import triangulate
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.motion.observations import Observations, RigArrays
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Camera, Imu, Rig, StereoPair

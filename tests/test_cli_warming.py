@@ -24,7 +24,7 @@ def read_terminal(terminal: int, process: subprocess.Popen[bytes]) -> bytes:
 
 def test_warmup_in_a_terminal_shows_a_bar_while_it_compiles(tmp_path: Path) -> None:
     shutil.copytree(cache_root(), tmp_path / "kernels")
-    for folder in (tmp_path / "kernels").glob("graphvio.frontend.prediction-*"):
+    for folder in (tmp_path / "kernels").glob("graphvio.frontend.depth.prediction-*"):
         shutil.rmtree(folder)
     for expected in (True, False):  # the second time there is nothing to compile
         terminal, theirs = pty.openpty()

@@ -8,10 +8,10 @@ from synthetic import seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.frontend.depth_errors import by_depth_errors
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.refinement import refine
-from graphvio.frontend.stereo import triangulate
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.motion.depth_errors import by_depth_errors
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import refine
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Rig
 from graphvio.self_calibration.parameters import (

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float
-from graphvio.frontend.depth_scale import is_of_singles, with_free_length
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.refinement import Refined
+from graphvio.frontend.motion.depth_scale import is_of_singles, with_free_length
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import Refined
 from graphvio.geometry import se3_exp, se3_inverse
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.simulation.named_rigs import stereo_and_back

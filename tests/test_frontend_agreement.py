@@ -10,15 +10,15 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.agreement import Agreement, MotionHypothesis, _consensus_sets, _in_order, agree
-from graphvio.frontend.frozen import Frozen
-from graphvio.frontend.observations import Correspondences, Observations, RigArrays
-from graphvio.frontend.pair_reports import pair_reports
-from graphvio.frontend.quality import StereoShare, checked_hypothesis, motion_with_quality, stereo_share
-from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import searched_and_refined
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.imaging.frozen import Frozen
+from graphvio.frontend.motion.observations import Correspondences, Observations, RigArrays
+from graphvio.frontend.motion.quality import StereoShare, checked_hypothesis, motion_with_quality, stereo_share
+from graphvio.frontend.motion.refinement import Refined
+from graphvio.frontend.motion.selection import searched_and_refined
+from graphvio.frontend.pairs.agreement import Agreement, MotionHypothesis, _consensus_sets, _in_order, agree
+from graphvio.frontend.pairs.pair_reports import pair_reports
 from graphvio.frontend.tracking_frontend import TrackedFrameset
-from graphvio.frontend.tracks import TrackedFrame
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion

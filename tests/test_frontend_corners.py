@@ -4,7 +4,7 @@ import pytest
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.config.stages import CornerConfig
-from graphvio.frontend.corners import find_corners, occupied_cells, thinned
+from graphvio.frontend.imaging.corners import find_corners, occupied_cells, thinned
 
 SETTINGS = CornerConfig()
 HEIGHT, WIDTH = 240, 320

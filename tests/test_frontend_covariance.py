@@ -21,8 +21,8 @@ from monte_carlo import (
 
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.observations import Observations
-from graphvio.frontend.refinement import refine
+from graphvio.frontend.motion.observations import Observations
+from graphvio.frontend.motion.refinement import refine
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 
 CONFIG = replace(MotionConfig(), sigma_inflation=1.0, hypotheses=60)

@@ -6,8 +6,8 @@ from scipy.special import chdtri
 from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.extrinsic_monitor import ExtrinsicMonitor, combined, placed
-from graphvio.frontend.refinement import Refined
+from graphvio.frontend.motion.refinement import Refined
+from graphvio.frontend.pairs.extrinsic_monitor import ExtrinsicMonitor, combined, placed
 from graphvio.geometry import se3_exp, se3_log
 
 NONE = np.zeros(6)

@@ -7,9 +7,9 @@ from synthetic import seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.few_points import fit_few_points
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.refinement import refine
+from graphvio.frontend.motion.few_points import fit_few_points
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import refine
 from graphvio.geometry import se3_exp, se3_log
 
 RIG = two_pair_rig()

@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphvio.arrays import Image
-from graphvio.frontend.frozen import FrozenImages
+from graphvio.frontend.imaging.frozen import FrozenImages
 from graphvio.measurements.sensors import FrameSet
 
 RNG = np.random.default_rng(0)

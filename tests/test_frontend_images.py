@@ -6,7 +6,7 @@ from synthetic import two_pair_rig
 
 from graphvio.arrays import AnyArray
 from graphvio.errors import RigError
-from graphvio.frontend.images import checked
+from graphvio.frontend.imaging.images import checked
 from graphvio.measurements.sensors import FrameSet
 
 RIG = two_pair_rig()

@@ -8,8 +8,8 @@ from synthetic import transform
 from waves import picture, waves
 
 from graphvio.arrays import Float, Image
-from graphvio.frontend.keyframe_patches import KeyframePatches
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.tracking.keyframe_patches import KeyframePatches
 from graphvio.rig import Camera, SingleCamera, StereoPair
 
 WIDTH, HEIGHT, FOCAL, BASELINE_M = 320, 240, 250.0, 0.1

@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
-from graphvio.frontend.blocks import POINTS, SIZE, in_blocks, lane_by_lane, point_by_point
-from graphvio.frontend.cost import camera_motions
-from graphvio.frontend.linearisation import (
+from graphvio.frontend.motion.blocks import POINTS, SIZE, in_blocks, lane_by_lane, point_by_point
+from graphvio.frontend.motion.cost import camera_motions
+from graphvio.frontend.motion.linearisation import (
     LinearisationPoints,
     allocate_points,
     information_through_points,
     linearise,
     relinearise_points,
 )
-from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.motion.observations import Observations, RigArrays
 
 RIG = two_pair_rig()
 ARRAYS = RigArrays.of(RIG)

@@ -8,9 +8,9 @@ import pytest
 from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
-from graphvio.frontend.lucas_kanade import build_pyramid, register, track
-from graphvio.frontend.patches import bordered_room, lattice, prepare, room
-from graphvio.frontend.sampling import pixel_words
+from graphvio.frontend.imaging.lucas_kanade import build_pyramid, register, track
+from graphvio.frontend.imaging.patches import bordered_room, lattice, prepare, room
+from graphvio.frontend.imaging.sampling import pixel_words
 
 LEVELS = 4
 

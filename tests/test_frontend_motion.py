@@ -10,13 +10,13 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import camera_motions, robust_cost
-from graphvio.frontend.noise import noise_by_pair
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.paper_method import PairPoints, cost
-from graphvio.frontend.ransac import hypothesise, preempt, search
-from graphvio.frontend.refinement import explained, refine
-from graphvio.frontend.selection import best_pair_motion, global_cost, searched_and_refined
+from graphvio.frontend.motion.cost import camera_motions, robust_cost
+from graphvio.frontend.motion.noise import noise_by_pair
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.paper_method import PairPoints, cost
+from graphvio.frontend.motion.ransac import hypothesise, preempt, search
+from graphvio.frontend.motion.refinement import explained, refine
+from graphvio.frontend.motion.selection import best_pair_motion, global_cost, searched_and_refined
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.rig import Rig
 
@@ -95,7 +95,7 @@ def test_search_with_an_obstructed_pair_samples_few(monkeypatch: pytest.MonkeyPa
         sampled.append(arguments[2])
         return hypothesise(*arguments)
 
-    monkeypatch.setattr("graphvio.frontend.ransac.hypothesise", counted)
+    monkeypatch.setattr("graphvio.frontend.motion.ransac.hypothesise", counted)
     sound = seen_points(RIG, TRUTH, 60, seed(3), sigma_px=0.3)
     blocked = seen_points(RIG, TRUTH, 60, seed(4), sigma_px=0.3, outlier_share=1.0)
     seen = Observations(*(np.concatenate([a, b]) for a, b in zip(sound.of_pair(0), blocked.of_pair(1), strict=True)))

@@ -11,12 +11,12 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.cost import camera_motions, robust_cost
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.paper_method import PairPoints, best_pair, cost, global_cost, h, motion_of_pair, rho
-from graphvio.frontend.refinement import refine
-from graphvio.frontend.selection import best_pair_motion
-from graphvio.frontend.selection import global_cost as global_cost_of_kernel
+from graphvio.frontend.motion.cost import camera_motions, robust_cost
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.paper_method import PairPoints, best_pair, cost, global_cost, h, motion_of_pair, rho
+from graphvio.frontend.motion.refinement import refine
+from graphvio.frontend.motion.selection import best_pair_motion
+from graphvio.frontend.motion.selection import global_cost as global_cost_of_kernel
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.rig import Rig, StereoPair
 

@@ -8,7 +8,7 @@ from synthetic import transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.cameras import project_points
-from graphvio.frontend.prediction import (
+from graphvio.frontend.depth.prediction import (
     around,
     inverse_depths_around,
     predict_pixels,

@@ -7,9 +7,9 @@ import pytest
 
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.observations import Correspondences, correspond
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.motion.observations import Correspondences, correspond
 from graphvio.frontend.references import References
-from graphvio.frontend.tracks import TrackedFrame
 
 NEAR, FAR = 0.5, 0.01  # 1/m
 SIGMA_W = 0.005  # of a depth, 1/m, for pixels of 1 px: near ones are known well, far ones hardly

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from synthetic import random_transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.resection import real_quartic_roots, resect
+from graphvio.frontend.motion.resection import real_quartic_roots, resect
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from graphvio.arrays import Float, Image
-from graphvio.frontend.lucas_kanade import register
-from graphvio.frontend.patches import lattice, room
-from graphvio.frontend.sampling import pixel_words, sample, sample_affine, scratch_room
+from graphvio.frontend.imaging.lucas_kanade import register
+from graphvio.frontend.imaging.patches import lattice, room
+from graphvio.frontend.imaging.sampling import pixel_words, sample, sample_affine, scratch_room
 
 IMAGE: Image = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
 

@@ -5,9 +5,9 @@ import pytest
 from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
-from graphvio.frontend.lucas_kanade import register
-from graphvio.frontend.sampling import pixel_words
-from graphvio.frontend.slanted import align_slanted
+from graphvio.frontend.depth.slanted import align_slanted
+from graphvio.frontend.imaging.lucas_kanade import register
+from graphvio.frontend.imaging.sampling import pixel_words
 
 HALF = 7
 DISPARITY = 12.3

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.standstill import Standstill
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.tracking.standstill import Standstill
 
 PERIOD_NS = 50_000_000
 PLACES = np.random.default_rng(0).uniform(0.0, 400.0, (60, 2))

@@ -6,8 +6,8 @@ from synthetic import transform
 from graphvio.arrays import Bool, Float, Image
 from graphvio.cameras import RADIAL_TANGENTIAL, project_points, unproject_pixels
 from graphvio.config.stages import StereoConfig
-from graphvio.frontend.lucas_kanade import build_pyramid
-from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
+from graphvio.frontend.depth.stereo import epipolar_lines, epipolar_search, triangulate
+from graphvio.frontend.imaging.lucas_kanade import build_pyramid
 
 FOCAL, BASELINE = 400.0, 0.1
 INTRINSICS = np.array([FOCAL, FOCAL, 160.0, 120.0])

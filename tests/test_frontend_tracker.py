@@ -14,10 +14,10 @@ from waves import picture, waves
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.config import Config
 from graphvio.config.stages import CornerConfig
-from graphvio.frontend.lucas_kanade import build_pyramid
-from graphvio.frontend.matching import StereoMatcher
-from graphvio.frontend.tracker import GroupTracker
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.matching import StereoMatcher
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.imaging.lucas_kanade import build_pyramid
+from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.rig import Camera, StereoPair
 
 WIDTH, HEIGHT = 320, 240

@@ -14,7 +14,7 @@ from calibration_walks import with_wrong_place
 from graphvio import Config, Estimate, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float, Image
 from graphvio.evaluation.measures import umeyama_se3
-from graphvio.frontend.matching import StereoMatcher, StereoMatches
+from graphvio.frontend.depth.matching import StereoMatcher, StereoMatches
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult

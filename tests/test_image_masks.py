@@ -15,7 +15,7 @@ from graphvio import FrameSet, Odometry, RigError, Trajectory, load_trajectory, 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.errors import MeasurementError
 from graphvio.evaluation import evaluate
-from graphvio.frontend.images import ImageMask, UsablePixels, checked
+from graphvio.frontend.imaging.images import ImageMask, UsablePixels, checked
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Camera

@@ -11,8 +11,8 @@ from graphvio import FrameSet, Odometry, open_source
 from graphvio.arrays import AnyArray, Image
 from graphvio.config.stages import CornerConfig
 from graphvio.evaluation import evaluate
-from graphvio.frontend.corners import find_corners
-from graphvio.frontend.image_noise import NoiseFilter, has_less_contrast, noise_sigma
+from graphvio.frontend.imaging.corners import find_corners
+from graphvio.frontend.imaging.image_noise import NoiseFilter, has_less_contrast, noise_sigma
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 

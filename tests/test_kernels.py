@@ -12,7 +12,7 @@ import pytest
 
 from graphvio import kernel_cache, kernels
 from graphvio.cameras import EQUIDISTANT, project_points
-from graphvio.frontend.resection import real_quartic_roots
+from graphvio.frontend.motion.resection import real_quartic_roots
 from graphvio.geometry import se3_adjoint, se3_exp, se3_log
 
 ROOT = Path(kernels.__file__).parents[1]
@@ -215,7 +215,7 @@ def test_digest_of_a_real_kernel_reaches_geometry(monkeypatch: pytest.MonkeyPatc
         return read_bytes(path)
 
     monkeypatch.setattr(Path, "read_bytes", spy)
-    kernel_cache.source_digest("graphvio.frontend.refinement")
+    kernel_cache.source_digest("graphvio.frontend.motion.refinement")
     assert {"refinement.py", "cost.py", "geometry.py", "kernels.py", "observations.py"} <= set(read)
 
 

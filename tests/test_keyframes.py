@@ -15,8 +15,8 @@ from graphvio import Config, ConfigError, Estimate, FrameSet, Odometry, Predicti
 from graphvio.arrays import AnyArray, Float, Image
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import WindowError
-from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import TrackedFrame, common_rows
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.odometry.step import NewKeyframe, Step

@@ -15,9 +15,9 @@ from graphvio.arrays import AnyArray, Float
 from graphvio.backend.gating import gate_innovation
 from graphvio.backend.noise import own_covariance
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.agreement import disagreement
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.refinement import refine
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import refine
+from graphvio.frontend.pairs.agreement import disagreement
 from graphvio.linear_algebra import eigen, product, squared_length
 
 PLACES = range(0, 64, 8)  # bytes from a cache line's beginning

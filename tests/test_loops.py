@@ -11,8 +11,8 @@ import pytest
 
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
-from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import resect_features

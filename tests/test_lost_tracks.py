@@ -9,7 +9,7 @@ from waves import picture, waves
 
 from graphvio import Config, FrameSet, Odometry, open_source
 from graphvio.evaluation import evaluate
-from graphvio.frontend.lost_tracks import image_shift, motion_of_found
+from graphvio.frontend.tracking.lost_tracks import image_shift, motion_of_found
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.events import EventKind
 from graphvio.trajectory import Trajectory

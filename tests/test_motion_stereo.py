@@ -5,7 +5,7 @@ import pytest
 from synthetic import CAM_AXES, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
+from graphvio.frontend.depth.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 
 SIGMA_PX, FOCAL_PX = 0.3, 400.0

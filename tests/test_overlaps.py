@@ -12,8 +12,8 @@ from recordings import half_size
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.frontend.overlaps import MIN_OVERLAP
 from graphvio.frontend.singles import SinglesFrontend
+from graphvio.frontend.tracking.overlaps import MIN_OVERLAP
 from graphvio.geometry import so3_exp
 from graphvio.rig import Camera, Rig, axes_angle_deg, overlap
 from graphvio.simulation import Simulator, build_scene, default_rig

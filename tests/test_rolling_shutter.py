@@ -13,9 +13,9 @@ from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.config import Config
 from graphvio.evaluation import evaluate
-from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines, pixels_at_stamp
-from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines, pixels_at_stamp
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.odometry.synchroniser import Synchroniser

@@ -3,7 +3,7 @@
 import numpy as np
 from synthetic import transform
 
-from graphvio.frontend.steady_motion import SteadyMotion
+from graphvio.frontend.tracking.steady_motion import SteadyMotion
 from graphvio.measurements.motion import RelativeMotion
 
 

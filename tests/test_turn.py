@@ -7,7 +7,7 @@ import pytest
 from numpy.random import Generator
 
 from graphvio.arrays import Float
-from graphvio.frontend.turn import turn_between
+from graphvio.frontend.tracking.turn import turn_between
 from graphvio.geometry import se3, se3_inverse, so3_exp, so3_log
 from graphvio.measurements.motion import CameraTracks
 from graphvio.simulation.named_rigs import stereo_and_back

@@ -9,11 +9,11 @@ import pytest
 
 from graphvio.arrays import Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH
-from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import joint_motion, searched_and_refined
-from graphvio.frontend.stereo import triangulate
+from graphvio.frontend.depth.motion_stereo import PRIOR_INVERSE_DEPTH
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import Refined
+from graphvio.frontend.motion.selection import joint_motion, searched_and_refined
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.simulation.named_rigs import stereo_and_back
 

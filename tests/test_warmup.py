@@ -19,8 +19,8 @@ import graphvio.warmup
 from graphvio.arrays import Image
 from graphvio.cli import app
 from graphvio.config import Config
-from graphvio.frontend.tracker import GroupTracker
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.simulation import default_rig
 from graphvio.simulation.named_rigs import NAMED_RIGS, rig_of
 from graphvio.warmup import warm_up
@@ -94,8 +94,8 @@ assert compiled() == before, compiled() - before
 
 
 @pytest.mark.parametrize(("part", "modules"), [
-    ("tracking", ["graphvio.frontend.lucas_kanade", "graphvio.backend.propagation"]),
-    ("motion", ["graphvio.frontend.refinement", graphvio.warmup._CALIBRATION]),
+    ("tracking", ["graphvio.frontend.imaging.lucas_kanade", "graphvio.backend.propagation"]),
+    ("motion", ["graphvio.frontend.motion.refinement", graphvio.warmup._CALIBRATION]),
 ])  # fmt: skip
 def test_other_process_compiles_its_part(part: str, modules: list[str]) -> None:
     done = subprocess.run(

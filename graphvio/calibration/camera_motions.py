@@ -11,7 +11,7 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.backend.noise import own_covariance
 from graphvio.config import Config
-from graphvio.frontend.steady_motion import SteadyMotion
+from graphvio.frontend.tracking.steady_motion import SteadyMotion
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion

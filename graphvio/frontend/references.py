@@ -8,9 +8,9 @@ import numpy as np
 
 from graphvio.arrays import Bool, Int
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.observations import Correspondences
+from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
+from graphvio.frontend.motion.observations import Correspondences
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.rig import Rig
 
 _T = THRESHOLDS.reference

@@ -8,12 +8,12 @@ import numpy as np
 
 from graphvio.arrays import Bool, Int
 from graphvio.config import Config
-from graphvio.frontend.handover import Handover, Leaving
-from graphvio.frontend.images import ImageMask
-from graphvio.frontend.overlaps import Overlaps
+from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
+from graphvio.frontend.imaging.images import ImageMask
 from graphvio.frontend.thresholds import THRESHOLDS
+from graphvio.frontend.tracking.handover import Handover, Leaving
+from graphvio.frontend.tracking.overlaps import Overlaps
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
-from graphvio.frontend.tracks import TrackedFrame, common_rows
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.rig import Rig
 from graphvio.timing import timed

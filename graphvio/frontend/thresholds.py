@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 @dataclass(frozen=True)
 class AgreementThresholds:
-    """When pairs agree on one motion, and when a second one is looked for (`graphvio.frontend.agreement`).
+    """When pairs agree on one motion, and when a second one is looked for (`graphvio.frontend.pairs.agreement`).
 
     Attributes:
         max_distance: Squared Mahalanobis distance of motions that agree: normal errors exceed it once in 2 million.
@@ -43,7 +43,7 @@ class AgreementThresholds:
 
 @dataclass(frozen=True)
 class QualityThresholds:
-    """When a motion is weak, and by how much its covariance grows (`graphvio.frontend.quality`).
+    """When a motion is weak, and by how much its covariance grows (`graphvio.frontend.motion.quality`).
 
     Attributes:
         min_rival_share: Support of another hypothesis, as a share of the first, that makes it a possible one.
@@ -87,7 +87,7 @@ class ReferenceThresholds:
 
 @dataclass(frozen=True)
 class ExtrinsicThresholds:
-    """When the extrinsics between two pairs are taken to be wrong (`graphvio.frontend.extrinsic_monitor`).
+    """When the extrinsics between two pairs are taken to be wrong (`graphvio.frontend.pairs.extrinsic_monitor`).
 
     Attributes:
         max_motions: Motions over whole keyframes that are kept.
@@ -116,7 +116,7 @@ class ExtrinsicThresholds:
 
 @dataclass(frozen=True)
 class StandstillThresholds:
-    """When images show a standstill (`graphvio.frontend.standstill`).
+    """When images show a standstill (`graphvio.frontend.tracking.standstill`).
 
     Attributes:
         max_median_px: Half of the points have not moved by more.

@@ -11,18 +11,18 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
-from graphvio.frontend.extrinsic_monitor import ExtrinsicError
-from graphvio.frontend.extrinsics import RigExtrinsics
-from graphvio.frontend.frozen import Frozen, FrozenImages
-from graphvio.frontend.images import ImageMask, checked
-from graphvio.frontend.motion_stereo import MotionHistory
-from graphvio.frontend.observations import Correspondences, correspond
+from graphvio.frontend.depth.motion_stereo import MotionHistory
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.imaging.frozen import Frozen, FrozenImages
+from graphvio.frontend.imaging.images import ImageMask, checked
+from graphvio.frontend.motion.observations import Correspondences, correspond
+from graphvio.frontend.pairs.extrinsic_monitor import ExtrinsicError
+from graphvio.frontend.pairs.extrinsics import RigExtrinsics
 from graphvio.frontend.references import References
-from graphvio.frontend.rolling_shutter import ReadoutMotion
-from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.frontend.tracker import GroupTracker
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
+from graphvio.frontend.tracking.standstill import Standstill
+from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.motion import VisualResult
 from graphvio.measurements.sensors import FrameSet

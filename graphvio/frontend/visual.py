@@ -11,18 +11,18 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
-from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
-from graphvio.frontend.depth_errors import by_depth_errors
-from graphvio.frontend.depth_scale import is_of_singles, with_free_length
-from graphvio.frontend.few_points import FewPoints, fit_few_points
-from graphvio.frontend.images import ImageMask
-from graphvio.frontend.pair_reports import inliers_of, pair_reports
-from graphvio.frontend.quality import CheckedHypothesis, checked_hypothesis, motion_with_quality, stereo_share
-from graphvio.frontend.refinement import Refined
-from graphvio.frontend.selection import best_pair_motion, joint_motion
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.imaging.images import ImageMask
+from graphvio.frontend.motion.depth_errors import by_depth_errors
+from graphvio.frontend.motion.depth_scale import is_of_singles, with_free_length
+from graphvio.frontend.motion.few_points import FewPoints, fit_few_points
+from graphvio.frontend.motion.quality import CheckedHypothesis, checked_hypothesis, motion_with_quality, stereo_share
+from graphvio.frontend.motion.refinement import Refined
+from graphvio.frontend.motion.selection import best_pair_motion, joint_motion
+from graphvio.frontend.pairs.agreement import Agreement, MotionHypothesis, agree, is_supported
+from graphvio.frontend.pairs.pair_reports import inliers_of, pair_reports
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
-from graphvio.frontend.tracks import TrackedFrame
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig

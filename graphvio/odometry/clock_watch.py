@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.backend.imu_match import VisualStep, match_rates, turn_disagreement
 from graphvio.backend.inertial import MeanReadings
-from graphvio.frontend.turn import turn_between
+from graphvio.frontend.tracking.turn import turn_between
 from graphvio.geometry import se3
 from graphvio.measurements.motion import CameraTracks
 from graphvio.monocular.sample_buffer import MAX_TIME_OFFSET_NS

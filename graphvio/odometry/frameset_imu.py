@@ -9,7 +9,7 @@ from graphvio.backend.estimator import ImuFaultTolerant, StateEstimator
 from graphvio.backend.initialisation import shows_standstill
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
-from graphvio.frontend.rolling_shutter import ReadoutMotion
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
 from graphvio.geometry import se3
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval

@@ -18,7 +18,7 @@ from graphvio.backend.propagation import Propagator
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
-from graphvio.frontend.images import ImageMask
+from graphvio.frontend.imaging.images import ImageMask
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.frontend.visual import VisualFrontend

@@ -12,7 +12,7 @@ import numpy as np
 from graphvio.arrays import Image
 from graphvio.config import Config
 from graphvio.errors import RigError
-from graphvio.frontend.tracker import GroupTracker
+from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import VisualResult

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from graphvio.arrays import Float, Image
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, RelativeMotion

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from graphvio.frontend.extrinsic_monitor import ExtrinsicError, describe
+from graphvio.frontend.pairs.extrinsic_monitor import ExtrinsicError, describe
 from graphvio.measurements.events import CORRECTED, EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.rig import Rig, StereoPair

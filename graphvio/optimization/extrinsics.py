@@ -1,8 +1,8 @@
 """The rig's calibration as variables of the graph: extrinsics of each pair, and the IMU's time offset.
 
 A pair whose true ``body_T_left`` is ``C`` times the rig file's measures a motion ``M`` of body as ``C^-1 M C``, see
-`graphvio.frontend.extrinsic_monitor`. Its images are taken ``d`` later on the IMU's clock than by the rig file, so that
-it sees body at ``x exp(d xi)``, with the twist ``xi`` of body.
+`graphvio.frontend.pairs.extrinsic_monitor`. Its images are taken ``d`` later on the IMU's clock than by the rig file,
+so that it sees body at ``x exp(d xi)``, with the twist ``xi`` of body.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ class InnovationErrors:
     The innovation is the motion of body by vision less that by the IMU. To a motion M of body, an error d of the
     cameras' extrinsics adds ``(Ad(M^-1) - I) d``, an error D of the gyro's matrix the rotation ``D phi`` with M's
     rotation vector phi, and an error of the time offset the motion that body makes in it at the end, less that at the
-    beginning. Errors within a pair add what wrong depths do, see `graphvio.frontend.depth_errors`. All are taken as
-    independent.
+    beginning. Errors within a pair add what wrong depths do, see `graphvio.frontend.motion.depth_errors`. All are taken
+    as independent.
 
     Args:
         covariance: (C, C) of the calibration of the cameras and the IMU.

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
-from graphvio.frontend.tracks import TrackedFrame, common_rows
+from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
 from graphvio.kernels import kernel
 from graphvio.measurements.motion import LocatedPoints
 from graphvio.odometry.step import NewKeyframe

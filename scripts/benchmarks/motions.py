@@ -9,7 +9,7 @@ from scipy.stats import chi2, norm
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import MeasurementUpdate
-from graphvio.frontend.rolling_shutter import ReadoutMotion
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
 from graphvio.frontend.tracking_frontend import MotionPredictor
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.estimate import Estimate, Status

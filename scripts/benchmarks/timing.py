@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.recordings import Footage
 from benchmarks.reference import ReferencePipeline
 from graphvio.config import Config
-from graphvio.frontend.steady_motion import SteadyMotion
+from graphvio.frontend.tracking.steady_motion import SteadyMotion
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.odometry import Odometry
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Int
-from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.motion_stereo import FirstSights, MotionHistory
+from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 from graphvio.optimization.loops.matching import alike
 from graphvio.optimization.record import SessionRecord

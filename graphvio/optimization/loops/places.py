@@ -6,10 +6,10 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
-from graphvio.frontend.images import UsablePixels
-from graphvio.frontend.lucas_kanade import MIN_GRADIENT, build_pyramid
-from graphvio.frontend.matching import StereoMatcher
-from graphvio.frontend.tracks import TrackedFrame, usable_at
+from graphvio.frontend.depth.matching import StereoMatcher
+from graphvio.frontend.depth.tracks import TrackedFrame, usable_at
+from graphvio.frontend.imaging.images import UsablePixels
+from graphvio.frontend.imaging.lucas_kanade import MIN_GRADIENT, build_pyramid
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Camera, StereoPair

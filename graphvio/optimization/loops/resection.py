@@ -16,14 +16,14 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.agreement import is_supported
-from graphvio.frontend.keyframe_patches import KeyframePatches
-from graphvio.frontend.lucas_kanade import MIN_GRADIENT
-from graphvio.frontend.observations import Observations, RigArrays, correspond
-from graphvio.frontend.prediction import predict_pixels
-from graphvio.frontend.refinement import Refined, refine
-from graphvio.frontend.selection import searched_and_refined
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.prediction import predict_pixels
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.frontend.imaging.lucas_kanade import MIN_GRADIENT
+from graphvio.frontend.motion.observations import Observations, RigArrays, correspond
+from graphvio.frontend.motion.refinement import Refined, refine
+from graphvio.frontend.motion.selection import searched_and_refined
+from graphvio.frontend.pairs.agreement import is_supported
+from graphvio.frontend.tracking.keyframe_patches import KeyframePatches
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.motion_depth import FEATURE_SIGMA_PX

@@ -11,8 +11,8 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config import Config
-from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import TrackedFrame
+from graphvio.frontend.depth.stereo import triangulate
+from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import PairFeatures

@@ -1,0 +1,213 @@
+"""Depth of a single camera's points from its motion, as triangulation has it for a pair.
+
+At each keyframe after the one at which a track began, its inverse depth is the least-squares solution of the rays of
+its first sight and of the newest one, for the motion that all cameras measured in between. Before there is any
+baseline a wide prior stands for the depth: such a point constrains the motion by its epipolar line only, as its
+covariance says.
+
+The motion's error is common to all points, which a covariance for each of them cannot say: an unknown common scale
+takes its place where a motion is estimated by these points, see `graphvio.frontend.motion.depth_scale`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.geometry import se3_adjoint, se3_inverse
+from graphvio.kernels import kernel
+from graphvio.rig import Camera
+
+PRIOR_INVERSE_DEPTH = 0.2
+_PRIOR_SIGMA = 10.0  # 1/m: next to nothing is known
+_DRIFT_PX2 = 1.0  # variance that a track's place gains from keyframe to keyframe, for a pixel noise of 1 px
+_MAX_KEYFRAMES = 40
+_STEPS = 5
+_MIN_DEPTH_RATIO = 1e-3
+_MAX_DISTANCE = 25.0  # squared, in standard deviations: the point moves, or is another one
+
+
+class Since(NamedTuple):
+    """Motion from an earlier keyframe to the newest one.
+
+    Attributes:
+        cur_T_then: (4, 4) of body.
+        covariance: (6, 6), tangent ``[rotation, translation]`` from the left, in body now.
+        keyframes: number of keyframes from that one to the newest one.
+    """
+
+    cur_T_then: Float
+    covariance: Float
+    keyframes: int
+
+
+class MotionHistory:
+    """Motions of the rig from its latest keyframes to the newest one."""
+
+    def __init__(self) -> None:
+        self._since: dict[int, Since] = {}
+        self.newest_ns: int | None = None
+
+    def advance(self, then_ns: int, now_ns: int, cur_T_then: Float, covariance: Float) -> None:
+        """Add a keyframe, with the motion (4, 4) since another one and its covariance (6, 6)."""
+        if then_ns != self.newest_ns:
+            self.restart(then_ns)
+        adjoint = se3_adjoint(np.ascontiguousarray(cur_T_then))
+        since = {
+            ns: Since(
+                cur_T_then @ each.cur_T_then, adjoint @ each.covariance @ adjoint.T + covariance, each.keyframes + 1
+            )
+            for ns, each in list(self._since.items())[-_MAX_KEYFRAMES:]
+        }
+        self.restart(now_ns)
+        self._since = since | self._since
+
+    def recalibrate(self, new_T_old: Float) -> None:
+        """Use another body frame (4, 4), in which the cameras' motions are the same and body's are others."""
+        old_T_new, adjoint = se3_inverse(new_T_old), se3_adjoint(np.ascontiguousarray(new_T_old))
+        self._since = {
+            ns: Since(new_T_old @ each.cur_T_then @ old_T_new, adjoint @ each.covariance @ adjoint.T, each.keyframes)
+            for ns, each in self._since.items()
+        }
+
+    def restart(self, now_ns: int) -> None:
+        """Begin with a keyframe whose motion since the others is not known."""
+        self._since = {now_ns: Since(np.eye(4), np.zeros((6, 6)), 0)}
+        self.newest_ns = now_ns
+
+    def since(self, then_ns: int) -> Since | None:
+        """Return the motion since a keyframe, or None if it is not known."""
+        return self._since.get(then_ns)
+
+
+class FirstSights:
+    """First sights of one camera's tracks, from which their depth is computed."""
+
+    def __init__(self) -> None:
+        self._ids: Int = np.zeros(0, dtype=np.int64)
+        self._stamps_ns: Int = np.zeros(0, dtype=np.int64)
+        self._rays: Float = np.zeros((0, 2))
+
+    def recalibrate(self, then: Camera, now: Camera) -> None:
+        """Use another calibration of the camera, by which the same pixels have other normalised coordinates."""
+        pixels, is_seen = then.project(np.column_stack([self._rays, np.ones(len(self._rays))]))
+        rays, has_ray = now.unproject(pixels)
+        self._rays = np.where((is_seen & has_ray)[:, None], rays, self._rays)
+
+    def locate(
+        self, ids: Int, rays: Float, history: MotionHistory, body_T_cam: Float, focal_px: float, sigma_px: float
+    ) -> tuple[Float, Float]:
+        """Compute the points of a keyframe's tracks; tracks that have none begin here.
+
+        Args:
+            ids: (N,) of the tracks, increasing.
+            rays: (N, 2) their normalised coordinates.
+            history: with this keyframe as the newest one.
+            body_T_cam: (4, 4) of the camera.
+            focal_px: pixels per normalised image unit.
+            sigma_px: pixel noise.
+
+        Returns:
+            Points (N, 3) ``[x, y, 1/Z]`` and their covariances (N, 3, 3) for a pixel noise of 1 px, as
+            `graphvio.frontend.depth.stereo.triangulate` has them.
+        """
+        assert history.newest_ns is not None
+        stamps_ns, first = self._of_tracks(ids, rays, history)
+        instants, which = np.unique(stamps_ns, return_inverse=True)
+        cam_T_body, since = se3_inverse(body_T_cam), [history.since(int(ns)) for ns in instants]
+        adjoint = se3_adjoint(cam_T_body)
+        known = [each for each in since if each is not None]  # all of them, by `_of_tracks`
+        then_T_now = np.array([cam_T_body @ se3_inverse(each.cur_T_then) @ body_T_cam for each in known])
+        motion = np.array([adjoint @ each.covariance @ adjoint.T for each in known]) / sigma_px**2
+        drift = np.array([_DRIFT_PX2 * each.keyframes for each in known])
+        points, covariances, fits = _locate(
+            rays, first, which, then_T_now.reshape(-1, 4, 4), motion.reshape(-1, 6, 6), drift, 1.0 / focal_px**2,
+            (_PRIOR_SIGMA / sigma_px) ** 2, _MAX_DISTANCE * sigma_px**2,
+        )  # fmt: skip
+        self._ids, self._rays = ids, np.where(fits[:, None], first, rays)
+        self._stamps_ns = np.where(fits, stamps_ns, history.newest_ns)
+        return points, covariances
+
+    def _of_tracks(self, ids: Int, rays: Float, history: MotionHistory) -> tuple[Int, Float]:
+        """Return stamps (N,) and rays (N, 2) of the tracks' first sights: this keyframe where there is none."""
+        stamps_ns, first = np.full(len(ids), history.newest_ns, dtype=np.int64), rays.copy()
+        if len(self._ids):
+            rows = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
+            reached = {int(ns): history.since(int(ns)) is not None for ns in np.unique(self._stamps_ns)}
+            is_known = np.array([reached[int(ns)] for ns in self._stamps_ns[rows]], dtype=bool)
+            has = (self._ids[rows] == ids) & is_known
+            stamps_ns[has], first[has] = self._stamps_ns[rows[has]], self._rays[rows[has]]
+        return stamps_ns, first
+
+
+@kernel
+def _locate(
+    rays: Float, first: Float, which: Int, then_T_now: Float, motion: Float, drift: Float, pixel: float,
+    prior: float, max_distance: float,
+) -> tuple[Float, Float, Bool]:  # fmt: skip
+    """Compute points (N, 3), covariances (N, 3, 3), and which of them (N,) fit the motion; the others have the prior.
+
+    Args:
+        rays: (N, 2) now.
+        first: (N, 2) normalised coordinates at the tracks' first sights.
+        which: (N,) number of the instant.
+        then_T_now: (A, 4, 4) of the camera, for each instant.
+        motion: (A, 6, 6) covariance of the motion in the camera's frame now, for a pixel noise of 1 px.
+        drift: (A,) variance of the track's place, pixels squared.
+        pixel: variance of a pixel in normalised coordinates.
+        prior: variance of the inverse depth, for a pixel noise of 1 px.
+        max_distance: largest squared whitened error.
+    """
+    n = len(rays)
+    points, covariances, fits = np.empty((n, 3)), np.zeros((n, 3, 3)), np.ones(n, dtype=np.bool_)
+    by_ray, by_motion = np.empty((2, 2)), np.empty((2, 6))
+    for i in range(n):
+        m, c = then_T_now[which[i]], motion[which[i]]
+        x, y, w = rays[i, 0], rays[i, 1], PRIOR_INVERSE_DEPTH
+        variance, gain_x, gain_y, e2 = prior, 0.0, 0.0, 0.0
+        for _ in range(_STEPS):
+            z = max(m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3], _MIN_DEPTH_RATIO)
+            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]) / z
+            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]) / z
+            for k in range(3):
+                a, b = (m[0, k] - u * m[2, k]) / z, (m[1, k] - v * m[2, k]) / z
+                if k < 2:
+                    by_ray[0, k], by_ray[1, k] = a, b
+                by_motion[0, 3 + k], by_motion[1, 3 + k] = -w * a, -w * b
+            # The rotation moves the point p = (x, y, 1) by its cross product with p.
+            for r in range(2):
+                g0, g1 = by_ray[r, 0], by_ray[r, 1]
+                g2 = (m[r, 2] - (u if r == 0 else v) * m[2, 2]) / z
+                by_motion[r, 0] = g1 - g2 * y
+                by_motion[r, 1] = g2 * x - g0
+                by_motion[r, 2] = g0 * y - g1 * x
+            j0, j1 = (m[0, 3] - u * m[2, 3]) / z, (m[1, 3] - v * m[2, 3]) / z
+            own = pixel * (1.0 + drift[which[i]])
+            s00 = own + pixel * (by_ray[0, 0] ** 2 + by_ray[0, 1] ** 2)
+            s11 = own + pixel * (by_ray[1, 0] ** 2 + by_ray[1, 1] ** 2)
+            s01 = pixel * (by_ray[0, 0] * by_ray[1, 0] + by_ray[0, 1] * by_ray[1, 1])
+            for p in range(6):
+                for q in range(6):
+                    s00 += by_motion[0, p] * c[p, q] * by_motion[0, q]
+                    s01 += by_motion[0, p] * c[p, q] * by_motion[1, q]
+                    s11 += by_motion[1, p] * c[p, q] * by_motion[1, q]
+            det = s00 * s11 - s01 * s01
+            r0, r1 = first[i, 0] - u, first[i, 1] - v
+            # J^T S^-1
+            k0, k1 = (j0 * s11 - j1 * s01) / det, (j1 * s00 - j0 * s01) / det
+            variance = 1.0 / (k0 * j0 + k1 * j1 + 1.0 / prior)
+            gain_x = -variance * (k0 * by_ray[0, 0] + k1 * by_ray[1, 0])
+            gain_y = -variance * (k0 * by_ray[0, 1] + k1 * by_ray[1, 1])
+            e2 = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / det
+            w += variance * (k0 * r0 + k1 * r1 + (PRIOR_INVERSE_DEPTH - w) / prior)
+        # Where the motion is hardly known, rounding may make S indefinite, and variances negative.
+        if not (0.0 <= e2 < max_distance and w >= -3.0 * np.sqrt(variance)):
+            fits[i], w, variance, gain_x, gain_y = False, PRIOR_INVERSE_DEPTH, prior, 0.0, 0.0
+        points[i, 0], points[i, 1], points[i, 2] = x, y, w
+        covariances[i, 0, 0] = covariances[i, 1, 1] = pixel
+        covariances[i, 0, 2] = covariances[i, 2, 0] = pixel * gain_x
+        covariances[i, 1, 2] = covariances[i, 2, 1] = pixel * gain_y
+        covariances[i, 2, 2] = variance
+    return points, covariances, fits

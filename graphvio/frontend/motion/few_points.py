@@ -1,0 +1,112 @@
+"""What few points show of a motion: too little to measure it, but enough to correct how it is predicted.
+
+Before a blank wall, a handful of points may be in view. They constrain the motion in some directions only, or with so
+little redundancy that wrong points do not stand out. But an IMU predicts the motion since the last frameset to a
+fraction of a pixel. Wrong points then do stand out, and the errors of the others are linear in the error of the
+prediction: their normal equations are information about the motion, and the state estimator weighs it against the
+IMU's. It is what these points would contribute as landmarks of a tightly coupled estimator.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.frontend.motion.cost import MIN_DEPTH_RATIO, camera_motions
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.geometry import se3_exp
+
+_PREDICTION_SIGMAS = np.repeat([0.05, 0.2], 3)  # rad, m: far more than a prediction by an IMU may be off
+_ROUNDS = 4
+_MIN_POINTS = 3  # fewer could not contradict each other
+_CUTOFF2 = 25.0  # squared whitened error of a point, which one right point in 20,000 exceeds
+_PRIOR_RESIDUALS = 3.0  # weight of the expected noise, where so few residuals show the actual one
+
+
+class FewPoints(NamedTuple):
+    """A motion as it is predicted, corrected in the directions that few points show.
+
+    Attributes:
+        cur_T_ref: (4, 4) of body.
+        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant: of what the
+            points show, without the prediction, so that it is large where they show nothing.
+        inlier: (N,) the points that agree with it.
+    """
+
+    cur_T_ref: Float
+    covariance: Float
+    inlier: Bool
+
+
+def fit_few_points(
+    rig: RigArrays, observations: Observations, predicted: Float, sigma_px: float, max_error_px: float
+) -> FewPoints | None:
+    """Correct a predicted motion by few points, by least squares without those that do not fit.
+
+    Args:
+        rig: of P pairs.
+        observations: N points of any subset of them.
+        predicted: ``cur_T_ref`` (4, 4), to about ``max_error_px``.
+        sigma_px: expected noise of a pixel; residuals may show that there is more.
+        max_error_px: largest error of a point under the predicted motion.
+
+    Returns:
+        The motion, or None where fewer than three points fit.
+    """
+    errors, by_motion, in_front = _whitened(rig, observations, predicted, sigma_px)
+    prior, correction = np.diag(_PREDICTION_SIGMAS**-2.0), np.zeros(6)
+    cutoff2 = (max_error_px / sigma_px) ** 2
+    for _ in range(_ROUNDS):
+        inlier = in_front & (_squared(errors - by_motion @ correction) < cutoff2)
+        used = by_motion[inlier]
+        information = np.einsum("nka,nkb->ab", used, used)
+        correction = np.linalg.solve(information + prior, np.einsum("nka,nk->a", used, errors[inlier]))
+        cutoff2 = min(cutoff2, _CUTOFF2)
+    if inlier.sum() < _MIN_POINTS:
+        return None
+    errors_left = _squared(errors - by_motion @ correction)[inlier].sum()
+    redundancy = max(np.where(observations.has_right[inlier], 4.0, 2.0).sum() - 6.0, 0.0)
+    variance = max((errors_left + _PRIOR_RESIDUALS) / (redundancy + _PRIOR_RESIDUALS), 1.0)
+    return FewPoints(se3_exp(correction) @ predicted, np.linalg.inv(information / variance + prior), inlier)
+
+
+def _squared(errors: Float) -> Float:
+    return np.asarray(np.sum(errors**2, axis=1))
+
+
+def _whitened(
+    rig: RigArrays, observations: Observations, cur_T_ref: Float, sigma_px: float
+) -> tuple[Float, Float, Bool]:
+    """Compute the errors (N, 4) of points in both images, and their derivatives (N, 4, 6) by ``exp(d) cur_T_ref``.
+
+    Both are divided by the standard deviation ``S^1/2``, as in `graphvio.frontend.motion.linearisation`; rows of an
+    image that does not see the point are zero. The third result (N,) says which points are in front of their cameras.
+    """
+    pair, (x, y, w), n = observations.pair, observations.points.T, len(observations.pair)
+    at_reference = np.column_stack([x, y, np.ones(n), w])  # homogeneous, over the depth there
+    in_body = np.einsum("nij,nj->ni", cur_T_ref @ rig.body_T_left[pair], at_reference)
+    to_camera = camera_motions(np.ascontiguousarray(cur_T_ref), rig)[pair]
+    errors, by_motion, by_point = np.zeros((n, 4)), np.zeros((n, 4, 6)), np.zeros((n, 4, 3))
+    in_front = np.ones(n, dtype=bool)
+    for side, seen in enumerate((observations.left, observations.right)):
+        is_seen = observations.has_right if side else np.ones(n, dtype=bool)
+        in_camera = np.einsum("nij,nj->ni", to_camera[:, side], at_reference)[:, :3]
+        is_near_plane = in_camera[:, 2] < MIN_DEPTH_RATIO
+        in_front &= ~(is_seen & is_near_plane)
+        scale = np.where(is_seen & ~is_near_plane, rig.focal_px[pair, side], 0.0)
+        depth = np.where(is_near_plane, 1.0, in_camera[:, 2])
+        projected = in_camera[:, :2] / depth[:, None]
+        by_place = np.zeros((n, 2, 3))  # in the camera
+        by_place[:, [0, 1], [0, 1]] = (scale / depth)[:, None]
+        by_place[:, :, 2] = -(scale / depth)[:, None] * projected
+        rows = slice(2 * side, 2 * side + 2)
+        errors[:, rows] = np.where(is_seen[:, None], scale[:, None] * (seen - projected), 0.0)
+        turned = by_place @ rig.cam_T_body[pair, side, :3, :3]
+        by_motion[:, rows, :3] = np.cross(in_body[:, None, :3], turned)
+        by_motion[:, rows, 3:] = w[:, None, None] * turned
+        by_point[:, rows] = by_place @ to_camera[:, side][:, :3, [0, 1, 3]]
+    covariances = sigma_px**2 * (np.eye(4) + by_point @ observations.covariances @ by_point.transpose(0, 2, 1))
+    whitener = np.linalg.inv(np.linalg.cholesky(covariances))
+    return np.einsum("nij,nj->ni", whitener, errors), whitener @ by_motion, in_front

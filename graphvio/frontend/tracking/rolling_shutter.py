@@ -1,0 +1,140 @@
+"""Compensation of rolling shutters: where points of an image were seen at its stamp, and where a line sees them.
+
+Lines are exposed one after the other, the first at the image's stamp. Within the readout the rig is taken to turn and
+to move at constant accelerations; a point's depth says how its pixel moves with that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.cameras import distort, fold_radius
+from graphvio.frontend.depth.tracks import TrackedFrame
+from graphvio.geometry import se3_inverse, so3_exp, so3_log
+from graphvio.kernels import kernel
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.rig import Camera, CameraGroup, SingleCamera
+
+_ROUNDS = 3  # a point's line depends on its pixel, and its pixel on the line
+_MIN_Z = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ReadoutMotion:
+    """How body moves while an image is read out.
+
+    Attributes:
+        angular_velocity: (3,) rad/s at the image's stamp, frame body.
+        velocity: (3,) m/s at the image's stamp, frame body at that instant.
+        angular_acceleration: (3,) rad/s^2, frame body.
+        acceleration: (3,) m/s^2, frame body at the stamp.
+    """
+
+    angular_velocity: Float
+    velocity: Float
+    angular_acceleration: Float = field(default_factory=lambda: np.zeros(3))
+    acceleration: Float = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def accelerated(interval: ImuInterval, gyro_bias: Float, velocity: Float, acceleration: Float) -> ReadoutMotion:
+        """Return the motion that a gyro measures during the readout; its rate is taken to change linearly."""
+        steps_s, rates = interval.steps_s, interval.angular_velocity - gyro_bias
+        seconds = float(steps_s.sum())
+        between_s = seconds - 0.5 * (steps_s[0] + steps_s[-1])  # from the middle of the first step to that of the last
+        angular_acceleration = (rates[-1] - rates[0]) / between_s if between_s > 0.5 * seconds else np.zeros(3)
+        first_rate = steps_s @ rates / seconds - 0.5 * seconds * angular_acceleration
+        return ReadoutMotion(first_rate, velocity, angular_acceleration, acceleration)
+
+    @staticmethod
+    def steady(cur_T_prev: Float, seconds: float) -> ReadoutMotion:
+        """Return the motion that continues one of body (4, 4), of points, over some seconds."""
+        prev_T_cur = se3_inverse(cur_T_prev)
+        rate = so3_log(np.ascontiguousarray(prev_T_cur[:3, :3])) / seconds
+        return ReadoutMotion(rate, prev_T_cur[:3, :3].T @ prev_T_cur[:3, 3] / seconds)
+
+
+def pixels_at_stamp(camera: Camera, pixels: Float, inverse_depths: Float, motion: ReadoutMotion) -> tuple[Float, Float]:
+    """Return the pixels (N, 2) at which a global shutter would have seen points at the stamp, and their inverse depths.
+
+    Args:
+        camera: with a rolling shutter.
+        pixels: (N, 2) as seen.
+        inverse_depths: (N,) 1/m, at their lines' instants.
+        motion: of body.
+
+    Returns:
+        Pixels (N, 2), as given where the point would have been out of view, and inverse depths (N,).
+    """
+    rays, _ = camera.unproject(pixels)
+    return _moved(
+        pixels, rays, inverse_depths, 1e-6 * camera.line_time_us * pixels[:, 1], *_columns(motion), False,
+        camera.body_T_cam, camera.model_number, camera.intrinsics, camera.distortion,
+    )  # fmt: skip
+
+
+def pixels_at_lines(camera: Camera, pixels: Float, inverse_depths: Float, motion: ReadoutMotion) -> tuple[Float, Float]:
+    """Return the pixels (N, 2) at which a rolling shutter sees points that it would see at the stamp at given ones.
+
+    This is the inverse of `pixels_at_stamp`, with the inverse depths at the stamp.
+    """
+    rays, _ = camera.unproject(pixels)
+    seen, depths = pixels, inverse_depths
+    for _ in range(_ROUNDS):
+        seen, depths = _moved(
+            pixels, rays, inverse_depths, 1e-6 * camera.line_time_us * seen[:, 1], *_columns(motion), True,
+            camera.body_T_cam, camera.model_number, camera.intrinsics, camera.distortion,
+        )  # fmt: skip
+    return seen, depths
+
+
+def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) -> TrackedFrame:
+    """Return a frame whose points are as global shutters would have seen them at the stamp; pixels stay.
+
+    The cameras of a pair have seen a point at nearly one instant, so that its depth is known before.
+    """
+    depths = np.where(frame.has_depth, np.maximum(frame.points[:, 2], 0.0), 0.0)
+    left_px, depths_then = pixels_at_stamp(group.left, frame.pixels, depths, motion)
+    shutter_px = np.zeros((len(frame.ids), 2, 2))
+    shutter_px[:, 0] = left_px - frame.pixels
+    if isinstance(group, SingleCamera):
+        left, _ = group.left.unproject(left_px)
+        return replace(frame, left_rays=left, points=np.column_stack([left, depths_then]), shutter_px=shutter_px)
+    right_T_left = group.right_T_left
+    z = np.column_stack([frame.left_rays, np.ones(len(depths))]) @ right_T_left[2, :3] + depths * right_T_left[2, 3]
+    right_px, _ = pixels_at_stamp(group.right, frame.right_pixels, depths / np.maximum(z, _MIN_Z), motion)
+    shutter_px[:, 1] = right_px - frame.right_pixels
+    return replace(frame, shutter_px=shutter_px).recalibrated(group)
+
+
+def _columns(motion: ReadoutMotion) -> tuple[Float, Float]:
+    """Return turn and shift as polynomials of time, (2, 3) each: the linear and the quadratic coefficients."""
+    turns = np.array([motion.angular_velocity, 0.5 * motion.angular_acceleration])
+    return turns, np.array([motion.velocity, 0.5 * motion.acceleration])
+
+
+@kernel
+def _moved(
+    pixels: Float, rays: Float, inverse_depths: Float, times_s: Float, turns: Float, shifts: Float, to_lines: bool,
+    body_T_cam: Float, model: int, intrinsics: Float, distortion: Float,
+) -> tuple[Float, Float]:  # fmt: skip
+    """Move points between the stamp and times (N,) after it: pixels (N, 2) and inverse depths (N,)."""
+    moved, depths = pixels.copy(), inverse_depths.copy()
+    limit = fold_radius(model, distortion)
+    body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
+    for i in range(len(pixels)):
+        t, w = times_s[i], inverse_depths[i]
+        turn = so3_exp(t * turns[0] + t * t * turns[1])
+        shift = body_R_cam.T @ (t * shifts[0] + t * t * shifts[1] + turn @ lever - lever)
+        turn = body_R_cam.T @ turn @ body_R_cam
+        ray = np.array([rays[i, 0], rays[i, 1], 1.0])
+        point = turn.T @ (ray - w * shift) if to_lines else turn @ ray + w * shift
+        z = point[2]
+        if not z > 1e-6 or not point[0] ** 2 + point[1] ** 2 < (limit * z) ** 2:
+            continue
+        xd, yd, _, _, _, _ = distort(model, distortion, point[0] / z, point[1] / z)
+        moved[i, 0], moved[i, 1] = intrinsics[0] * xd + intrinsics[2], intrinsics[1] * yd + intrinsics[3]
+        depths[i] = w / z
+    return moved, depths
