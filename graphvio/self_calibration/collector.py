@@ -81,6 +81,10 @@ class WindowCollector:
         self._last = Keyframe(stamp_ns, odom_T_body, views)
         self.keyframes.append(self._last)
 
+    def begin_window(self) -> None:
+        """Begin a window without keyframes; the next one has to be apart from the last keyframe all the same."""
+        self.keyframes = []
+
     def restart(self) -> None:
         """Discard the window that is not full: the poses that come are in another frame, or their clock is another."""
         self.keyframes, self._last = [], None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -119,8 +120,28 @@ def described(found: list[Finding]) -> list[str]:
     return sentences
 
 
-def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Float, float, str]]:
-    """Yield name, unit, factor to it, rows (N, C) of the difference, smallest error in the unit, and motion."""
+class _Part(NamedTuple):
+    """A part of the calibration, as people name it.
+
+    Attributes:
+        name: with that of the pair or camera.
+        unit: in which it is reported.
+        scale: factor to this unit.
+        rows: (N, C) its parameters, as rows that a difference from the rig file is multiplied with.
+        floor: error in the unit that is added to its uncertainty: less is no fault of a file.
+        motion: that shows it.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    rows: Float
+    floor: float
+    motion: str
+
+
+def _parts(estimate: CalibrationEstimate) -> Iterator[_Part]:
+    """Yield all parts, with the difference that a careful calibration may have as the floor."""
     rig, whole = estimate.file_rig, np.eye(len(estimate.difference))
     deg, first = float(np.rad2deg(1.0)), rig.groups[0].name
     for j, (group, of_group) in enumerate(zip(rig.groups, slices_of_groups(rig), strict=True)):
@@ -129,31 +150,30 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
             name = f"pair {group.name}"
             for which, camera in enumerate(group.cameras):
                 yield from _of_lens(camera, own[which * CAMERA :], 0.05, 0.3)
-            yield f"{name}, rotation left to right", "deg", deg, own[STEREO : STEREO + 3], 0.005, _DEPTHS
-            yield f"{name}, translation left to right", "mm", 1e3, own[STEREO + 3 : BODY], 0.1, SCALE_MOTION
+            rotation, translation = own[STEREO : STEREO + 3], own[STEREO + 3 : BODY]
+            yield _Part(f"{name}, rotation left to right", "deg", deg, rotation, 0.005, _DEPTHS)
+            yield _Part(f"{name}, translation left to right", "mm", 1e3, translation, 0.1, SCALE_MOTION)
         else:
             name = f"camera {group.name}"
             yield from _of_lens(group.left, own, 100.0 * SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX)
         if j > 0:
             relative = relative_to_first(rig, j) @ whole[: n_camera_parameters(rig)]
-            yield f"{name}, rotation against {first}", "deg", deg, relative[:3], 0.03, _TURN
-            yield f"{name}, translation against {first}", "mm", 1e3, relative[3:], 3.0, _TURN
+            yield _Part(f"{name}, rotation against {first}", "deg", deg, relative[:3], 0.03, _TURN)
+            yield _Part(f"{name}, translation against {first}", "mm", 1e3, relative[3:], 3.0, _TURN)
     if rig.imu is None:
         return
     at, extrinsics = n_camera_parameters(rig), whole[extrinsics_of(rig, 0)]
-    yield "cameras to IMU, rotation", "deg", deg, extrinsics[:3], 0.1, _TURN
-    yield "cameras to IMU, translation", "mm", 1e3, extrinsics[3:], 3.0, _TURN
-    yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN
-    yield "IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN
+    yield _Part("cameras to IMU, rotation", "deg", deg, extrinsics[:3], 0.1, _TURN)
+    yield _Part("cameras to IMU, translation", "mm", 1e3, extrinsics[3:], 3.0, _TURN)
+    yield _Part("IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN)
+    yield _Part("IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN)
     # With pairs, accelerations are seen in units of the baselines: where both differ, nothing shows which one is wrong.
     scale = "IMU, accelerometer's scale" + (" (or that of all baselines)" if rig.pairs else "")
-    yield scale, "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION
+    yield _Part(scale, "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION)
 
 
-def _of_lens(
-    camera: Camera, rows: Float, focal_percent: float, centre_px: float
-) -> Iterator[tuple[str, str, float, Float, float, str]]:
-    """Yield the parts of a lens, whose parameters come first in some rows (N, C), with their smallest errors."""
+def _of_lens(camera: Camera, rows: Float, focal_percent: float, centre_px: float) -> Iterator[_Part]:
+    """Yield the parts of a lens, whose parameters come first in some rows (N, C), with their floors."""
     focal = 100.0 / float(camera.intrinsics[:2].mean())
-    yield f"{camera.name}, focal lengths", "%", focal, rows[:2], focal_percent, _DEPTHS
-    yield f"{camera.name}, principal point", "px", 1.0, rows[2:INTRINSICS], centre_px, _DEPTHS
+    yield _Part(f"{camera.name}, focal lengths", "%", focal, rows[:2], focal_percent, _DEPTHS)
+    yield _Part(f"{camera.name}, principal point", "px", 1.0, rows[2:INTRINSICS], centre_px, _DEPTHS)

@@ -322,7 +322,8 @@ class SelfCalibration:
         self._pending = None
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.after_random_walk(change), self._prior.changed(change)
-        self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, 0
+        self._collector.begin_window()
+        self._adjusted_at = self._full_windows = 0
         self._used_windows, self._agreeing, self._refused = 0, 0, 0
         self._knocks = KnockDetector()  # offsets by another calibration are not comparable
         self.restarts += 1
@@ -342,23 +343,24 @@ class SelfCalibration:
         self._due_in = self._pace.delay_framesets
         self._adjusted_at = len(window)
         if is_full := len(window) >= WINDOW:
-            self._collector.keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
+            self._collector.begin_window()
+            self._adjusted_at, self._full_windows = 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.after_random_walk(duration_s * self._walk)
         samples = self._collector.samples_of(window)
         if is_full:
             self.on_full_window(FullWindow(window, samples, self._sigma_px))
         adjustment = WindowAdjustment(
-            self._rig,
-            self._nominal,
-            self._prior,
-            self.estimate.file_factors,
-            self._evidence,
-            self.estimate.posterior.mean,
-            window,
-            samples,
-            self._sigma_px,
-            is_full,
+            rig=self._rig,
+            nominal=self._nominal,
+            file_prior=self._prior,
+            factors=self.estimate.file_factors,
+            evidence=self._evidence,
+            difference=self.estimate.posterior.mean,
+            keyframes=window,
+            samples=samples,
+            sigma_px=self._sigma_px,
+            is_full=is_full,
         )
         self._pending = self._worker.submit(_when_compiled, adjustment)
 

@@ -26,6 +26,8 @@ _FIXED = 1e-9
 _FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
 _MAX_LAST_DAMPING = 1e-5  # a step that more damping makes small does not say that this is the minimum
 _MAX_DAMPING = 1e2  # beyond it steps change nothing
+_LESS_DAMPING, _MORE_DAMPING = 0.1, 100.0  # after a step that lowers the cost, and after one that does not
+_MIN_DAMPING_AFTER_A_FAILURE = 1e-4
 _ROUNDING = 1e-9  # of the cost, relative
 _GRAVITY_NORM_SIGMA = 5e-3
 
@@ -127,15 +129,17 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         changed = difference + step[calibration]
         kept = found
         found = Eliminated.empty(window.tracks)
-        damping = max(0.1 * damping, _MIN_DAMPING)
+        damping = max(_LESS_DAMPING * damping, _MIN_DAMPING)
         new = _linearise(following, moved, first, nominal, changed, prior, damping, found)
+        # Another time offset may take an end of an interval out of the samples: it has no error then, and the cost would
+        # be less for the wrong reason. Such steps are not taken, and an interval that is gained is not counted.
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
-        cost = new.cost - 0.5 * float(np.nansum(new.imu_errors2[np.isnan(at.imu_errors2)]))  # of what both cover
+        cost = new.cost - 0.5 * float(np.nansum(new.imu_errors2[np.isnan(at.imu_errors2)]))
         has_converged = bool(is_small and cost <= (1.0 + _ROUNDING) * at.cost and not loses_intervals)
         if cost <= at.cost and not loses_intervals:
             window, states, difference, at, damping_at = following, moved, changed, new, damping
         else:
-            found, damping = kept, max(100.0 * damping, 1e-4)
+            found, damping = kept, max(_MORE_DAMPING * damping, _MIN_DAMPING_AFTER_A_FAILURE)
         if has_converged or damping > _MAX_DAMPING:
             break
     if damping_at > _MIN_DAMPING:  # damped landmarks hold the cameras, as if their attitude in body were known

@@ -132,17 +132,17 @@ class WindowAdjustment:
         if self.samples is not None and not estimate.is_file_exact:
             inertial_state = newest_inertial_state(self.keyframes[-1].stamp_ns, fitted.solution)
         return AdjustedWindow(
-            self.keyframes,
-            self.is_full,
-            fitted.prior,
-            fitted.solution,
-            evidence,
-            estimate,
-            {} if estimate.is_file_exact else extrinsic_covariances(self.rig, anywhere),
-            anywhere,
-            evidence.mean_square(self.file_prior, in_force, fitted.likelihood)[:n, :n],
-            fitted.solution.poses_by_cameras(n),
-            inertial_state,
+            keyframes=self.keyframes,
+            is_full=self.is_full,
+            prior=fitted.prior,
+            solution=fitted.solution,
+            evidence=evidence,
+            estimate=estimate,
+            extrinsics={} if estimate.is_file_exact else extrinsic_covariances(self.rig, anywhere),
+            upper_covariance=anywhere,
+            covariance=evidence.mean_square(self.file_prior, in_force, fitted.likelihood)[:n, :n],
+            by_cameras=fitted.solution.poses_by_cameras(n),
+            inertial_state=inertial_state,
         )
 
 
