@@ -151,6 +151,7 @@ def _motions(truth: Float, rng: np.random.Generator) -> Motions:
         np.tile(covariance, (count - 1, 1, 1)),
         np.tile(_SHARED * covariance, (count - 1, 1, 1)),
         np.full(count - 1, 200),
+        np.zeros(count - 1, dtype=bool),
     )
 
 
@@ -173,6 +174,7 @@ def _own_motions(truth: Float, corrections: Sequence[Float], rng: np.random.Gene
         covariance.reshape(-1, 6, 6),
         np.zeros((len(row), 6, 6)),
         np.full(len(row), 100),
+        np.zeros(len(row), dtype=bool),
     )
     return motions, pair
 

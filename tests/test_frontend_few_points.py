@@ -16,6 +16,7 @@ RIG = two_pair_rig()
 ARRAYS = RigArrays.of(RIG)
 TRUTH = transform([0.02, -0.03, 0.05], [-0.06, 0.02, 0.01])  # cur_T_ref
 SIGMA_PX, MAX_PX = 0.3, 3.0
+HALVES = slice(0, 3), slice(3, 6)
 
 
 def predicted(rng: np.random.Generator) -> Float:
@@ -42,6 +43,29 @@ def test_fit_is_consistent(per_pair: int) -> None:
     assert np.mean(np.array(nees) > chi2.ppf(0.95, 6)) < 0.1
 
 
+@pytest.mark.parametrize("count", [5, 20])
+def test_fits_from_one_reference_are_consistent_together(count: int) -> None:
+    """What they share, the error of the triangulated points, does not become less by their number."""
+    nees = []
+    for number in range(100):
+        rng = np.random.default_rng(number)
+        seen, off, own, fits = seen_points(RIG, np.eye(4), 3, rng, SIGMA_PX), [], [], []
+        for _ in range(count):
+            noise = SIGMA_PX / ARRAYS.focal_px[seen.pair]
+            of_now = seen_points(RIG, np.eye(4), 3, np.random.default_rng(number))  # the same points without noise
+            left = of_now.left + noise[:, :1] * rng.standard_normal(seen.left.shape)
+            right = of_now.right + noise[:, 1:] * rng.standard_normal(seen.right.shape)
+            fit = fit_few_points(ARRAYS, seen._replace(left=left, right=right), np.eye(4), SIGMA_PX, MAX_PX)
+            assert fit is not None
+            fits.append(fit)
+            off.append(se3_log(fit.cur_T_ref))
+            own.append(np.linalg.inv(fit.covariance - fit.shared_covariance))
+        covariance = np.linalg.inv(np.sum(own, axis=0))
+        mean = covariance @ np.einsum("nij,nj->i", own, off)
+        nees.append(mean @ np.linalg.solve(covariance + fits[0].shared_covariance, mean))
+    assert 3.0 < np.mean(nees) < 9.0  # of 6; without the shared part, 50 for 20 of them
+
+
 def test_fit_of_many_points_is_the_refinement() -> None:
     seen, start = few(1, 100)
     fit, refined = fit_few_points(ARRAYS, seen, start, SIGMA_PX, MAX_PX), refine(ARRAYS, seen, start, MotionConfig())
@@ -56,9 +80,15 @@ def test_fit_knows_little_where_points_show_little() -> None:
     near = seen.of_rows(seen.pair == 0)
     fit = fit_few_points(ARRAYS, near, start, SIGMA_PX, MAX_PX)
     assert fit is not None
-    sigmas = np.sqrt(np.linalg.eigvalsh(fit.covariance))
-    assert sigmas[-1] > 10.0 * sigmas[0]
-    assert sigmas[-1] < 0.2  # no direction is freer than a prediction may be off
+    far = near._replace(
+        points=near.points * np.array([1.0, 1.0, 1e-9]), covariances=1e-18 * near.covariances,
+        left=near.points[:, :2], has_right=np.zeros(len(near.pair), dtype=bool),
+    )  # fmt: skip
+    nothing = fit_few_points(ARRAYS, far, np.eye(4), SIGMA_PX, MAX_PX)
+    assert nothing is not None
+    rotation, translation = (np.sqrt(np.linalg.eigvalsh(nothing.covariance[part, part])) for part in HALVES)
+    assert rotation[-1] < 0.1
+    assert translation[0] > 5.0  # what the IMU predicts is not information of the points
 
 
 @pytest.mark.parametrize("number", range(5))

@@ -61,8 +61,9 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
     covariance, zero = np.diag(SIGMAS**2), np.zeros((POSES, 3))
     no, nothing = np.zeros(POSES, dtype=bool), np.zeros((count, 6, 6))
     motions = Motions(
-        ends - 1, ends, np.array(relative), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100)
-    )
+        ends - 1, ends, np.array(relative), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100),
+        np.zeros(count, dtype=bool),
+    )  # fmt: skip
     none: list[Any] = [column[:0] for column in motions]
     return SessionRecord(
         name=name,

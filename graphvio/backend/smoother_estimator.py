@@ -46,7 +46,7 @@ _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is 
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
 _MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
 _MIN_OFF2 = 21.0  # squared Mahalanobis distance of a state, of 12 dimensions, that is not kept: 5 % exceed it by chance
-_MAX_PARTIAL_STATISTIC = 12.6  # squared Mahalanobis distance, of 6 dimensions: 5 % exceed it by chance
+_MAX_PARTIAL_STATISTIC = 25.0  # squared Mahalanobis distance, of up to 6 dimensions: chance exceeds it once in 3000
 _CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
 
 
@@ -77,7 +77,8 @@ class SmootherEstimator:
         self._is_chain_after_gap = False  # whether these begin at a state that the IMU alone has led to
         self._imu_failed = False  # samples were missing after the first rejected motion
         self._is_distrusted = False  # calibration of the IMU or initial state proved to be wrong
-        self._are_points_wrong = False  # the few ones of partial motions, since vision was last accepted
+        self._are_points_wrong = False  # the few ones of partial motions, since the last good motion
+        self._is_predicted_by_imu = False  # the newest state
         self._is_imu_left_out = False
         self._is_standstill_assumed = False  # by the IMU alone, which does not see a steady motion
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
@@ -167,6 +168,7 @@ class SmootherEstimator:
             self._reinitialise_after_gap(stamp_ns)
             return True
         self._imu_failed |= self.has_imu and interval is None and bool(self._refused)
+        self._is_predicted_by_imu = self.has_imu and interval is not None
         before = self.state()
         try:
             self._running.extend(stamp_ns, interval)
@@ -328,6 +330,8 @@ class SmootherEstimator:
         self.gate_results["vision"] = gate_result
         excess = smoother.excess_acceleration(motion)
         if gate_result.accepted and excess is None:
+            if visual.quality is Quality.GOOD:
+                self._are_points_wrong = False
             return self._accept(motion)
         why = gate_result.exceedance if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
@@ -337,14 +341,21 @@ class SmootherEstimator:
         return self._refuse(motion)
 
     def _apply_partial_motion(self, motion: RelativeMotion | None) -> MeasurementUpdate:
-        """Let few points correct the state that the IMU predicts, if they pass the gate; vision fails all the same."""
-        is_predicted = self.has_imu and not (self._is_imu_left_out or self._refused or self._status.is_lost)
-        if motion is None or not is_predicted or not self._running.knows(motion.reference_stamp_ns):
+        """Let few points correct the state that the IMU predicts, if they pass the gate; vision fails all the same.
+
+        Where they are not used, the keyframe need not go on.
+        """
+        if motion is None:
             return MeasurementUpdate(None)
-        # Few points may all be on somebody who walks by. The IMU shows it the sooner, the stricter the test.
-        self._are_points_wrong |= self._running.gate(motion).statistic > _MAX_PARTIAL_STATISTIC
+        is_predicted = self._is_predicted_by_imu and not (
+            self._is_imu_left_out or self._refused or self._status.is_lost
+        )
+        if not is_predicted or not self._running.knows(motion.reference_stamp_ns):
+            return MeasurementUpdate(None, needs_keyframe=True)
+        # Few points may all be on somebody who walks by.
+        self._are_points_wrong |= not self._running.gate(motion).statistic <= _MAX_PARTIAL_STATISTIC
         if self._are_points_wrong:
-            return MeasurementUpdate(None)
+            return MeasurementUpdate(None, needs_keyframe=True)
         self._running.add_partial_motion(motion)
         return MeasurementUpdate(None, partial_motion=motion)
 
@@ -487,7 +498,7 @@ class SmootherEstimator:
 
     def _initialise_at(self, initial: InitialState) -> None:
         self._accepted = 0
-        self._is_standstill_assumed = False
+        self._is_standstill_assumed = self._are_points_wrong = False
         self._running.initialise(initial.stamp_ns, initial.state, initial.uncertainty)
         self._reset_ns = initial.stamp_ns
         self.initialisations += 1
@@ -499,7 +510,7 @@ class SmootherEstimator:
     def _note_accepted(self) -> None:
         """Record that vision is accepted: nothing is refused any more, and the estimate is not lost."""
         self._refused.clear()
-        self._imu_failed = self._is_distrusted = self._are_points_wrong = False
+        self._imu_failed = self._is_distrusted = False
         self._status.is_lost = False
 
     @property

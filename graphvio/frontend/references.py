@@ -65,15 +65,37 @@ class References:
     def must_be_replaced(
         self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
     ) -> bool:
-        """Decide whether the next motions are measured from the newest frames.
-
-        A pair that the motion does not explain at all, such as one with a crowd in front of it, does not end the
-        keyframe of the others.
+        """Decide whether the next motions are measured from the newest frames, after a motion.
 
         Args:
             frames: Newest frame of each pair.
             correspondences: Points of them that the references have, too.
             inlier: (N,) The points that the motion explains.
+        """
+        return inlier.sum() < _T.min_points or self._have_lost_points(frames, correspondences, inlier)
+
+    def must_be_replaced_after_few(
+        self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
+    ) -> bool:
+        """Decide the same after a frameset whose points were too few for a motion.
+
+        The keyframe goes on while they are seen, and the newest frames could not measure a motion either.
+
+        Args:
+            frames: Newest frame of each pair.
+            correspondences: Points of them that the references have, too.
+            inlier: (N,) The points that agree with the prediction.
+        """
+        newest = sum(int(frame.has_depth.sum()) for frame in frames.values())
+        return newest >= self._config.min_inliers or self._have_lost_points(frames, correspondences, inlier)
+
+    def _have_lost_points(
+        self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
+    ) -> bool:
+        """Return whether too few of the references' points are still seen, against then or the newest frames.
+
+        A pair that the motion does not explain at all, such as one with a crowd in front of it, does not end the
+        keyframe of the others.
         """
         if self._config.reference == "previous":
             return True

@@ -75,11 +75,13 @@ class ReferenceThresholds:
     """When later motions are measured from a new frameset (`graphvio.frontend.references`).
 
     Attributes:
+        min_points: Points that the motion explains.
         min_near_share: Share, of the configured overlap, of the near points that have to be still in view.
         min_pair_share: Share, of the configured overlap, of a pair's tracks with depth that have to be usable points.
         max_absence_ns: A pair that was absent for longer is tracked from scratch.
     """
 
+    min_points: int = 20
     min_near_share: float = 0.5
     min_pair_share: float = 0.5
     max_absence_ns: int = 1_000_000_000

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.frontend.imaging.images import ImageMask
@@ -61,6 +61,7 @@ class VisualFrontend(TrackingFrontend):
         error_share = float(np.hypot(config.motion.shared_error_share, file_error_share))
         self._scale_sigma = 0.0 if rig.imu is None else error_share
         self._noise_px = config.motion.pixel_sigma_px  # of the last good motion's points
+        self._is_reference_of_few = False  # whether the reference began at points too few for a motion
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
 
     @property
@@ -142,22 +143,27 @@ class VisualFrontend(TrackingFrontend):
     def _fit_few_points(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> FewPoints | None:
         """Correct the predicted motion by points that are too few for a motion, if an IMU predicts it.
 
-        Where corners are not found in the right images, the few that are may be wrong all alike: they do not count.
+        Depths of single cameras have no scale of their own: only pairs count. Where corners are not found in the right
+        images, the few that are may be wrong all alike.
         """
+        if not seen.reference or self._rig.imu is None or seen.frozen.all_since_ns is not None:
+            return None
         observations = seen.correspondences.observations
-        is_few = seen.reference and 0 < len(observations.pair) < self._config.motion.min_inliers
-        # Depths of single cameras have no scale of their own.
-        are_pairs = all(j < len(self._rig.pairs) for j in observations.pairs)
-        if not (is_few and are_pairs) or self._rig.imu is None or seen.frozen.all_since_ns is not None:
+        is_of_pair = observations.pair < len(self._rig.pairs)
+        if not is_of_pair.any() or len(observations.pair) >= self._config.motion.min_inliers:
             return None
         if stereo_share(seen.reference, seen.frames, self._baselines_m).share < THRESHOLDS.quality.min_stereo_share:
             return None
         predicted = motion_since(seen.reference_stamp_ns)
         if predicted is None:
             return None
-        return fit_few_points(
-            self._extrinsics.arrays, observations, predicted, self._noise_px, self._config.motion.max_error_px
-        )
+        arrays, of_pairs = self._extrinsics.arrays, observations.of_rows(is_of_pair)
+        few = fit_few_points(arrays, of_pairs, predicted, self._noise_px, self._config.motion.max_error_px)
+        if few is None:
+            return None
+        inlier = np.zeros(len(is_of_pair), dtype=bool)
+        inlier[is_of_pair] = few.inlier
+        return few._replace(inlier=inlier)
 
     @timed("quality")
     def _judge(
@@ -215,11 +221,20 @@ class VisualFrontend(TrackingFrontend):
             keyframe goes on.
         """
         if agreement is None:
-            is_due = few is None or self._is_keyframe_due(seen, few.inlier)
-            return (self._refer_to(seen.frames) if is_due else {}), {}
+            # A keyframe of a motion ends here: what its points share is not what the few that are left share.
+            goes_on = (
+                few is not None
+                and self._is_reference_of_few
+                and not self._references.must_be_replaced_after_few(seen.frames, seen.correspondences, few.inlier)
+            )
+            self._is_reference_of_few = True
+            return ({} if goes_on else self._refer_to(seen.frames)), {}
+        self._is_reference_of_few = False
         refined, is_contradicted = agreement.hypotheses[0].refined, len(agreement.hypotheses) > 1
         # Where pairs contradict each other, many short motions soonest show which one is right.
-        if not is_contradicted and not self._is_keyframe_due(seen, refined.inlier):
+        if not is_contradicted and not self._references.must_be_replaced(
+            seen.frames, seen.correspondences, refined.inlier
+        ):
             return {}, {}
         own = self._own_motions(seen, agreement)
         self._extrinsics.learn(agreement.own)
@@ -234,9 +249,6 @@ class VisualFrontend(TrackingFrontend):
         config = self._config.motion
         rms_px = agreement.hypotheses[0].refined.rms_px() or config.pixel_sigma_px
         return max(config.sigma_inflation * rms_px, _MIN_NOISE_SHARE * config.pixel_sigma_px)
-
-    def _is_keyframe_due(self, seen: TrackedFrameset, inlier: Bool) -> bool:
-        return self._references.must_be_replaced(seen.frames, seen.correspondences, inlier)
 
     def _advance_histories(self, seen: TrackedFrameset, refined: Refined, motion_since: MotionPredictor) -> None:
         """Note the motion over the keyframe that ends, by which single cameras locate points."""
@@ -266,8 +278,7 @@ class VisualFrontend(TrackingFrontend):
 
     def _relative_motion(self, seen: TrackedFrameset, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
-        angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3].copy())), np.linalg.norm(ref_T_cur[:3, 3])
-        scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
+        scaled = self._scale_covariance(ref_T_cur)
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
         return RelativeMotion(
             seen.reference_stamp_ns,
@@ -278,13 +289,20 @@ class VisualFrontend(TrackingFrontend):
             int(refined.inlier.sum()),
         )
 
+    def _scale_covariance(self, ref_T_cur: Float) -> Float:
+        """Return the covariance (6, 6) of an error that is a share of a motion's angle and length."""
+        angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3].copy())), np.linalg.norm(ref_T_cur[:3, 3])
+        return np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
+
     def _partial_motion(self, seen: TrackedFrameset, few: FewPoints) -> RelativeMotion:
+        ref_T_cur = se3_inverse(few.cur_T_ref)
+        scaled = self._scale_covariance(ref_T_cur)
         motion = RelativeMotion(
             seen.reference_stamp_ns,
             seen.stamp_ns,
-            se3_inverse(few.cur_T_ref),
-            few.covariance,
-            np.zeros((6, 6)),
+            ref_T_cur,
+            few.covariance + scaled,
+            few.shared_covariance,
             int(few.inlier.sum()),
             pairs=seen.correspondences.observations.of_rows(few.inlier).pairs,
         )

@@ -37,7 +37,7 @@ def adjust_forwards(
 ) -> Adjusted:
     """Adjust a window first with its landmarks held in front of their cameras, and then with free ones.
 
-    For arguments see `graphvio.monocular.adjustment.adjust`; states and landmarks are those before the window found the
+    For arguments see `graphvio.monocular.adjustment.adjust`; states and landmarks are those before it found the
     reverse motion.
     """
     is_behind = landmarks[:, 2] < 0.0

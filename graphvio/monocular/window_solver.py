@@ -6,6 +6,7 @@ What leaves is marginalised, and stays as a prior on the states that have seen t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ _MAX_SIGMA_PX = 0.6
 _NOISE_GAIN = 0.1  # of one keyframe
 _STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
 _CONVERGED = 0.1  # squared distance from the solution, in standard deviations; the next frameset goes on from there
+_MAX_EXCESS_COST = 1.0  # by which landmarks in front may fit worse than behind: views alone cannot distinguish them
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
@@ -166,9 +168,11 @@ class WindowSolver:
         adjusted = adjust(measured, window.states, places, prior, max_steps, self.calibration.file(), _CONVERGED)
         is_seen = np.isin(ids, window.views[-1].landmark)
         if is_reversed(adjusted, is_seen):
-            forwards = adjust_forwards(measured, window.states, places, prior, self.calibration.file(), _CONVERGED)
-            if not is_reversed(forwards, is_seen):
-                adjusted = forwards
+            with suppress(np.linalg.LinAlgError):
+                forwards = adjust_forwards(measured, window.states, places, prior, self.calibration.file(), _CONVERGED)
+                is_likelier = forwards.equations.cost < adjusted.equations.cost + _MAX_EXCESS_COST
+                if is_likelier and not is_reversed(forwards, is_seen):
+                    adjusted = forwards
         _put(adjusted, window, ids)
         return adjusted, ids
 

@@ -17,6 +17,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.innovation import InnovationErrors
 from graphvio.self_calibration.parameters import depths_of_pair
 
+_SHARED = 0.9  # of what is added to motions by few points, which the next ones from the same reference have, too
 _MAX_JUMP2 = 25.0  # squared Mahalanobis distance by the covariance of a motion
 
 
@@ -144,8 +145,13 @@ class CalibrationInnovationCovariance:
         motion = self._motion_with_covariance(motion, frozenset(motion.pairs), estimator)
         if motion.calibration_covariance is None:
             return motion
-        noisy = motion.covariance + motion.calibration_covariance
-        return replace(motion, covariance=noisy, calibration_covariance=None)
+        added = motion.calibration_covariance  # about the same of all motions from this reference
+        return replace(
+            motion,
+            covariance=motion.covariance + added,
+            shared_covariance=motion.shared_covariance + _SHARED * added,
+            calibration_covariance=None,
+        )
 
     def _motion_with_covariance(
         self, motion: RelativeMotion, pairs: frozenset[int], estimator: StateEstimator

@@ -128,7 +128,8 @@ class SessionGraph:
         record, config, epoch = nodes.record, self._config, nodes.epoch
         params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
         has_motion = np.zeros(len(nodes.rows), dtype=bool)
-        has_motion[np.searchsorted(nodes.rows, record.motions.row[nodes.motions])] = True
+        full = nodes.motions[~record.motions.is_partial[nodes.motions]]
+        has_motion[np.searchsorted(nodes.rows, record.motions.row[full])] = True
         has_motion[np.searchsorted(nodes.rows, record.views.row)] = True
         for n in range(1, len(nodes.rows)):
             if epoch[n] != epoch[n - 1]:

@@ -72,11 +72,14 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     wanted[ends] = wanted[ends + 1] = True
     wanted[0] = wanted[-1] = True
     wanted[record.own.reference] = wanted[record.own.row] = True
-    last = dict(zip(motions.reference.tolist(), motions.row.tolist(), strict=True))  # rows increase
-    wanted[list(last.values())] = True
+    for of_kind in (motions.is_partial, ~motions.is_partial):
+        last = dict(
+            zip(motions.reference[of_kind].tolist(), motions.row[of_kind].tolist(), strict=True)
+        )  # rows increase
+        wanted[list(last.values())] = True
     latest = stamps[0]
     seen = np.zeros(len(stamps), dtype=bool)
-    seen[motions.row] = True
+    seen[motions.row[~motions.is_partial]] = True
     if len(record.views.row):
         wanted[record.views.row] = wanted[record.first_windows.row] = True
         seen |= record.is_stationary  # of single cameras nothing else is known of a standstill

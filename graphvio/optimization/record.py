@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,6 +41,7 @@ class Motions(NamedTuple):
     covariance: Float  # (M, 6, 6) tangent ``[rotation, translation]`` in body at its end
     shared_covariance: Float  # (M, 6, 6) its part that all motions from one reference share, same tangent
     inliers: Int  # (M,) number of points
+    is_partial: Bool  # (M,) whether these were too few for a motion: see `VisualResult.partial_motion`
 
     def at(self, k: int, stamps_ns: Int) -> RelativeMotion:
         """Return motion k."""
@@ -126,6 +127,7 @@ class Recorder:
         self._steps: list[_Row] = []
         self._motions: list[RelativeMotion] = []
         self._own: list[tuple[int, RelativeMotion]] = []
+        self._partial: set[int] = set()  # stamps of partial motions
         self._refused: list[RelativeMotion] = []  # since the last motion that was used
         self._references: set[int] = set()
         self._since: list[tuple[Float, Float]] = []  # IMU since the last step with a pose
@@ -155,6 +157,7 @@ class Recorder:
             self._own += sorted(step.own.items())
         if step.partial_motion is not None:
             self._motions.append(step.partial_motion)
+            self._partial.add(step.partial_motion.stamp_ns)
         intervals = self._since
         self._steps.append(
             _Row(
@@ -210,8 +213,8 @@ class Recorder:
             is_start=np.array([row.is_start for row in rows]),
             keyframe_before=np.array([row_of.get(row.keyframe_before_ns, -1) for row in rows], dtype=np.int64),
             keyframe_covariance=np.array([row.keyframe_covariance for row in rows]),
-            motions=_joined([motion for motion in motions if _is_known(motion, row_of)], row_of),
-            own=_joined([motion for _, motion in self._own if _is_known(motion, row_of)], row_of),
+            motions=_joined([motion for motion in motions if _is_known(motion, row_of)], row_of, self._partial),
+            own=_joined([motion for _, motion in self._own if _is_known(motion, row_of)], row_of, set()),
             own_pair=np.array([j for j, motion in self._own if _is_known(motion, row_of)], dtype=np.int64),
             inertial=_joined_inertial(rows),
             views=Views.of([each for each in self._views if isinstance(each, WindowViews)], row_of),
@@ -263,7 +266,7 @@ def _is_known(motion: RelativeMotion, row_of: Mapping[int, int]) -> bool:
     return motion.stamp_ns in row_of and motion.reference_stamp_ns in row_of
 
 
-def _joined(motions: Sequence[RelativeMotion], row_of: Mapping[int, int]) -> Motions:
+def _joined(motions: Sequence[RelativeMotion], row_of: Mapping[int, int], partial: Set[int]) -> Motions:
     shape = (len(motions), 6, 6)
     return Motions(
         np.array([row_of[each.reference_stamp_ns] for each in motions], dtype=np.int64),
@@ -272,4 +275,5 @@ def _joined(motions: Sequence[RelativeMotion], row_of: Mapping[int, int]) -> Mot
         np.array([each.covariance for each in motions]).reshape(shape),
         np.array([each.shared_covariance for each in motions]).reshape(shape),
         np.array([each.inliers for each in motions], dtype=np.int64),
+        np.array([each.stamp_ns in partial for each in motions], dtype=bool),
     )

@@ -131,8 +131,8 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         found = Eliminated.empty(window.tracks)
         damping = max(_LESS_DAMPING * damping, _MIN_DAMPING)
         new = _linearise(following, moved, first, nominal, changed, prior, damping, found)
-        # Another time offset may take an end of an interval out of the samples: it has no error then, and the cost would
-        # be less for the wrong reason. Such steps are not taken, and an interval that is gained is not counted.
+        # Another time offset may take an end of an interval out of the samples: it has no error then, and the cost is
+        # less for the wrong reason. Such steps are not taken, and an interval that is gained is not counted.
         loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
         cost = new.cost - 0.5 * float(np.nansum(new.imu_errors2[np.isnan(at.imu_errors2)]))
         has_converged = bool(is_small and cost <= (1.0 + _ROUNDING) * at.cost and not loses_intervals)

@@ -16,9 +16,11 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.frontend.motion.cost import MIN_DEPTH_RATIO, camera_motions
 from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.refinement import SHARED_BOUNDS
 from graphvio.geometry import se3_exp
 
 _PREDICTION_SIGMAS = np.repeat([0.05, 0.2], 3)  # rad, m: far more than a prediction by an IMU may be off
+_NEXT_TO_NOTHING = 1e-4  # of the prior's information
 _ROUNDS = 4
 _MIN_POINTS = 3  # fewer could not contradict each other
 _CUTOFF2 = 25.0  # squared whitened error of a point, which one right point in 20,000 exceeds
@@ -31,12 +33,15 @@ class FewPoints(NamedTuple):
     Attributes:
         cur_T_ref: (4, 4) of body.
         covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant: of what the
-            points show, without the prediction, so that it is large where they show nothing.
+            points show, without the prediction, so that it is very large where they show nothing.
+        shared_covariance: (6, 6) the part of it that all motions from the same reference have in common, since they
+            depend on the same triangulated points.
         inlier: (N,) the points that agree with it.
     """
 
     cur_T_ref: Float
     covariance: Float
+    shared_covariance: Float
     inlier: Bool
 
 
@@ -55,7 +60,7 @@ def fit_few_points(
     Returns:
         The motion, or None where fewer than three points fit.
     """
-    errors, by_motion, in_front = _whitened(rig, observations, predicted, sigma_px)
+    errors, by_motion, through_points, in_front = _whitened(rig, observations, predicted, sigma_px)
     prior, correction = np.diag(_PREDICTION_SIGMAS**-2.0), np.zeros(6)
     cutoff2 = (max_error_px / sigma_px) ** 2
     for _ in range(_ROUNDS):
@@ -69,7 +74,20 @@ def fit_few_points(
     errors_left = _squared(errors - by_motion @ correction)[inlier].sum()
     redundancy = max(np.where(observations.has_right[inlier], 4.0, 2.0).sum() - 6.0, 0.0)
     variance = max((errors_left + _PRIOR_RESIDUALS) / (redundancy + _PRIOR_RESIDUALS), 1.0)
-    return FewPoints(se3_exp(correction) @ predicted, np.linalg.inv(information / variance + prior), inlier)
+    # The prior only bounds the correction: what it says is known from the IMU, and not to be counted twice.
+    covariance = np.linalg.inv(information / variance + _NEXT_TO_NOTHING * prior)
+    of_score = np.einsum("nab->ab", through_points[inlier]) / variance
+    shared = _bounded(covariance @ of_score @ covariance, covariance)
+    return FewPoints(se3_exp(correction) @ predicted, covariance, shared, inlier)
+
+
+def _bounded(shared: Float, covariance: Float) -> Float:
+    """Bound the shared part of a covariance (6, 6), so that it and what is left are positive definite."""
+    root = np.linalg.cholesky(covariance)
+    inverse = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
+    scaled = root @ axes * np.sqrt(np.clip(shares, *SHARED_BOUNDS))
+    return np.asarray(scaled @ scaled.T)
 
 
 def _squared(errors: Float) -> Float:
@@ -78,11 +96,15 @@ def _squared(errors: Float) -> Float:
 
 def _whitened(
     rig: RigArrays, observations: Observations, cur_T_ref: Float, sigma_px: float
-) -> tuple[Float, Float, Bool]:
-    """Compute the errors (N, 4) of points in both images, and their derivatives (N, 4, 6) by ``exp(d) cur_T_ref``.
+) -> tuple[Float, Float, Float, Bool]:
+    """Compute the whitened errors of points, and their derivatives.
 
-    Both are divided by the standard deviation ``S^1/2``, as in `graphvio.frontend.motion.linearisation`; rows of an
-    image that does not see the point are zero. The third result (N,) says which points are in front of their cameras.
+    Errors are divided by their standard deviation ``S^1/2``, as in `graphvio.frontend.motion.linearisation`; those in
+    an image that does not see the point are zero.
+
+    Returns:
+        Errors (N, 4) in both images; derivatives (N, 4, 6) by ``exp(d) cur_T_ref``; variance (N, 6, 6) of the score
+        by the error of the point itself, ``J^T S^-1 J - sigma^2 J^T S^-2 J``; and which points (N,) are in front.
     """
     pair, (x, y, w), n = observations.pair, observations.points.T, len(observations.pair)
     at_reference = np.column_stack([x, y, np.ones(n), w])  # homogeneous, over the depth there
@@ -109,4 +131,7 @@ def _whitened(
         by_point[:, rows] = by_place @ to_camera[:, side][:, :3, [0, 1, 3]]
     covariances = sigma_px**2 * (np.eye(4) + by_point @ observations.covariances @ by_point.transpose(0, 2, 1))
     whitener = np.linalg.inv(np.linalg.cholesky(covariances))
-    return np.einsum("nij,nj->ni", whitener, errors), whitener @ by_motion, in_front
+    whitened = whitener @ by_motion
+    twice = sigma_px * whitener.transpose(0, 2, 1) @ whitened
+    through_points = whitened.transpose(0, 2, 1) @ whitened - twice.transpose(0, 2, 1) @ twice
+    return np.einsum("nij,nj->ni", whitener, errors), whitened, through_points, in_front

@@ -42,7 +42,8 @@ _NEAR = 1e-4  # precise enough to determine inliers
 _WEAK_DIRECTION_SIGMA = 10.0
 _MIN_SHARE_OF_A_PAIR = 0.25
 _MIN_POINTS_OF_A_PAIR = 5
-_SHARED_BOUNDS = (0.02, 0.9)
+SHARED_BOUNDS = (0.02, 0.9)
+"""Of a covariance's part that motions from one reference share, over the covariance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +267,7 @@ def _bounded(shared: Float, root: Float, lower: Float) -> Float:
     turned = product(root, axes)
     scaled = turned.copy()
     for c in range(6):
-        share = min(max(shares[c], _SHARED_BOUNDS[0]), _SHARED_BOUNDS[1])
+        share = min(max(shares[c], SHARED_BOUNDS[0]), SHARED_BOUNDS[1])
         for r in range(6):
             scaled[r, c] *= share
     return product(scaled, turned.T.copy())
