@@ -41,6 +41,7 @@ from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.marginalisation import with_landmarks, without_first
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.reversal import adjust_forwards, is_reversed
+from graphvio.monocular.sample_buffer import SampleBuffer
 from graphvio.monocular.sightings import LandmarkIds, Landmarks
 from graphvio.monocular.states import States
 from graphvio.monocular.structure import (
@@ -51,8 +52,9 @@ from graphvio.monocular.structure import (
     landmarks_after,
     located,
 )
-from graphvio.monocular.window import MAX_ERROR2
+from graphvio.monocular.window import MAX_ERROR2, KeyframeWindow
 from graphvio.monocular.window_prior import Prior, add_prior, first_prior
+from graphvio.monocular.window_solver import WindowSolver
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.self_calibration.evidence import Evidence, Gaussian
@@ -1098,6 +1100,27 @@ def test_adjust_forwards_finds_the_motion_whose_reverse_was_found(
     assert not is_reversed(forwards, is_seen)
     assert forwards.equations.cost < found.equations.cost + 0.1
     assert np.linalg.norm(forwards.states.velocities - true.velocities, axis=1).max() < off_m_s
+
+
+def test_window_that_finds_the_reverse_motion_is_solved_again() -> None:
+    rig, flight, times = single_rig(), moving(), np.array([0.0, 0.15])
+    _, true, _, prior = problem(2, is_exact=True)
+    assert rig.imu is not None
+    samples = SampleBuffer(rig.imu, Config())
+    for ns in range(-60_000_000, 220_000_000, IMU_NS):
+        samples.add(ns, flight.reading(ns * 1e-9))
+    samples.collect(-60_000_000, 200_000_000)
+    tracks, landmark_ids = Tracks(rig, flight), LandmarkIds(1, 2)
+    views = [landmark_ids.join(tracks.camera_tracks(t, 0.3)) for t in times]
+    poses = true.poses.copy()
+    poses[1, :3, 3] = 2.0 * poses[0, :3, 3] - poses[1, :3, 3]
+    calibration = WindowCalibration(rig, False)
+    states = replace(true, poses=poses, velocities=-true.velocities, calibration=np.zeros(calibration.size))
+    prior = first_prior(states, np.full(6, 0.1), states.biases, POSE_SIGMAS)
+    window = KeyframeWindow(states, views, [False, False], landmark_ids, Landmarks(), prior, np.zeros(2))
+    solver = WindowSolver(Cameras.of(rig), calibration, samples)
+    solver.solve(window, int(states.stamps_ns[-1]), is_keyframe=True)
+    assert np.linalg.norm(window.states.velocities - true.velocities, axis=1).max() < 0.4
 
 
 # ------------------------------------------------------------------ rigs and commands
