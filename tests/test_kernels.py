@@ -262,7 +262,13 @@ def test_kernels_compute_what_their_python_does() -> None:
 
 
 def test_kernels_release_the_interpreter_and_divide_by_zero_quietly() -> None:
-    for module in ("geometry", "cameras", "frontend.cost", "frontend.refinement", "frontend.stereo"):
+    for module in (
+        "geometry",
+        "cameras",
+        "frontend.motion.cost",
+        "frontend.motion.refinement",
+        "frontend.depth.stereo",
+    ):
         for value in vars(importlib.import_module(f"graphvio.{module}")).values():
             if hasattr(value, "py_func"):
                 assert value.targetoptions["nogil"]
