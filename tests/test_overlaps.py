@@ -141,6 +141,31 @@ def test_tracks_are_found_where_other_cameras_see_their_points(
     frontend.close()
 
 
+def test_near_points_that_cameras_see_from_different_sides_are_not_matched() -> None:
+    def moved_out(camera: Camera) -> Camera:
+        pose = camera.body_T_cam.copy()
+        pose[:3, 3] *= 4.0
+        return replace(camera, body_T_cam=pose)
+
+    rig = surrounding().with_cameras(moved_out)
+    cameras = [single.left for single in rig.singles]
+    simulator = OnceRendered(build_scene("room", 1.0), rig, 1)
+    frontend, parallax, n_near = SinglesFrontend(rig, Config()), [], 0
+    visual = frontend.process(simulator.frameset(0), lambda _: np.eye(4))
+    for j, tracks in visual.camera_tracks.items():
+        columns, rows = np.rint(frontend.frames_at(simulator.stamps_ns[0])[j].pixels).astype(int).T
+        depths = simulator.view(0, j).depth[rows, columns]
+        for seen in tracks.matches:
+            baseline_m = np.linalg.norm((cameras[seen.camera].cam_T_body @ cameras[j].body_T_cam)[:3, 3])
+            parallax.append(baseline_m / depths[seen.rows])
+            n_near += int((baseline_m / depths > 0.25).sum())
+    frontend.close()
+    matched = np.concatenate(parallax)
+    assert len(matched) > 50
+    assert n_near > 50  # of the tracks
+    assert np.mean(matched > 0.25) < 0.02  # wrong matches
+
+
 def turned_in_file(rig: Rig, degrees: float) -> Rig:
     """Return a rig file whose cameras are turned at random, and whose principal points are 2 px off."""
     rng = np.random.default_rng(3)

@@ -30,12 +30,14 @@ from graphvio.kernels import kernel
 _SEARCH_CORRELATION = 0.7
 _MAX_SHIFT_PX = 4.0
 _PREDICTED_PX = 0.5
+_MAX_PARALLAX_RAD = 0.2  # between the rays of both cameras; beyond it errors are several times the usual noise
 
 
 class WarpedMatcher(StereoMatcher):
     """Matcher of one camera's corners in another that may look any other way.
 
     A patch is warped by the cameras' rotation to each other and their lenses, as of a surface that faces the camera.
+    Points that are so near that the cameras see them from too different directions are left out.
 
     Args:
         pair: the camera that has the corners, and the other one.
@@ -68,7 +70,9 @@ class WarpedMatcher(StereoMatcher):
             )
         warps, bends, usable = predict_warps(rays_beside, np.tile(expected, (5, 1)), step_px, *camera)
         guess, _, in_reach = epipolar_lines(rays, expected, *camera)
-        found = passes(np.ones(len(pixels), dtype=bool), seen & usable & in_reach, "search", rejected)
+        # A surface that does not face the camera looks the more unlike its patch, the more the directions differ.
+        is_alike = float(np.linalg.norm(pair.right_T_left[:3, 3])) * expected < _MAX_PARALLAX_RAD
+        found = passes(np.ones(len(pixels), dtype=bool), seen & usable & in_reach & is_alike, "search", rejected)
         matched, registered, localised, correlations = register(
             pixel_words(left[0]), right[0], pixels, warps, bends, guess, found, half, _MAX_SHIFT_PX, min_gradient, True
         )
