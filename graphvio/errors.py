@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 
 class GraphvioError(Exception):
@@ -73,8 +73,7 @@ class BenchmarkError(GraphvioError):
     """A data set is not known, or a folder holds none of its sequences."""
 
 
-@contextmanager
-def reading(place: object, error: type[GraphvioError], remedy: str) -> Iterator[None]:
+def reading(place: object, error: type[GraphvioError], remedy: str) -> AbstractContextManager[None]:
     """Raise a failure of the file system as a typed error.
 
     Args:
@@ -82,17 +81,13 @@ def reading(place: object, error: type[GraphvioError], remedy: str) -> Iterator[
         error: type to raise.
         remedy: what to do, the end of the message.
 
-    Raises:
-        GraphvioError: of that type, where the file system refuses to.
+    Returns:
+        A context whose `OSError` becomes the typed error.
     """
-    try:
-        yield
-    except OSError as failure:
-        raise error(f"{place}: cannot be read ({failure.strerror or failure}); {remedy}") from None
+    return _accessing(f"{place}: cannot be read", error, remedy)
 
 
-@contextmanager
-def writing(place: object, error: type[GraphvioError], remedy: str) -> Iterator[None]:
+def writing(place: object, error: type[GraphvioError], remedy: str) -> AbstractContextManager[None]:
     """Raise a failure of the file system as a typed error, as `reading` does.
 
     Args:
@@ -100,13 +95,18 @@ def writing(place: object, error: type[GraphvioError], remedy: str) -> Iterator[
         error: type to raise.
         remedy: what to do, the end of the message.
 
-    Raises:
-        GraphvioError: of that type, where the file system refuses to.
+    Returns:
+        A context whose `OSError` becomes the typed error.
     """
+    return _accessing(f"{place}: cannot be written", error, remedy)
+
+
+@contextmanager
+def _accessing(what: str, error: type[GraphvioError], remedy: str) -> Iterator[None]:
     try:
         yield
     except OSError as failure:
-        raise error(f"{place}: cannot be written ({failure.strerror or failure}); {remedy}") from None
+        raise error(f"{what} ({failure.strerror or failure}); {remedy}") from None
 
 
 @contextmanager

@@ -72,7 +72,7 @@ class References:
             correspondences: Points of them that the references have, too.
             inlier: (N,) The points that the motion explains.
         """
-        return inlier.sum() < _T.min_points or self._have_lost_points(frames, correspondences, inlier)
+        return int(inlier.sum()) < _T.min_points or self._have_lost_points(frames, correspondences, inlier)
 
     def must_be_replaced_after_few(
         self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool

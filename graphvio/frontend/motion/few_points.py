@@ -5,6 +5,9 @@ little redundancy that wrong points do not stand out. But an IMU predicts the mo
 fraction of a pixel. Wrong points then do stand out, and the errors of the others are linear in the error of the
 prediction: their normal equations are information about the motion, and the state estimator weighs it against the
 IMU's. It is what these points would contribute as landmarks of a tightly coupled estimator.
+
+This is the linearisation of `graphvio.frontend.motion.linearisation` in plain numpy, for the few framesets that need
+it: a kernel is compiled again for each caller, and would make the first such frameset, or every start, wait.
 """
 
 from __future__ import annotations
@@ -76,13 +79,13 @@ def fit_few_points(
     variance = max((errors_left + _PRIOR_RESIDUALS) / (redundancy + _PRIOR_RESIDUALS), 1.0)
     # The prior only bounds the correction: what it says is known from the IMU, and not to be counted twice.
     covariance = np.linalg.inv(information / variance + _NEXT_TO_NOTHING * prior)
-    of_score = np.einsum("nab->ab", through_points[inlier]) / variance
+    of_score = through_points[inlier].sum(axis=0) / variance
     shared = _bounded(covariance @ of_score @ covariance, covariance)
     return FewPoints(se3_exp(correction) @ predicted, covariance, shared, inlier)
 
 
 def _bounded(shared: Float, covariance: Float) -> Float:
-    """Bound the shared part of a covariance (6, 6), so that it and what is left are positive definite."""
+    """Bound the shared part of a covariance (6, 6), as `graphvio.frontend.motion.refinement` does."""
     root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
