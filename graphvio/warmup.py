@@ -35,10 +35,11 @@ from graphvio.frontend.motion.cost import camera_motions
 from graphvio.frontend.motion.depth_errors import by_depth_errors
 from graphvio.frontend.motion.depth_scale import with_unknown_scales
 from graphvio.frontend.motion.observations import Observations, RigArrays, correspond
+from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
 from graphvio.frontend.motion.selection import best_pair_motion, searched_and_refined
 from graphvio.frontend.pairs.extrinsic_monitor import warm_up_extrinsic_monitor
 from graphvio.frontend.singles import SinglesFrontend
-from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, pixels_at_lines
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, pixels_at_lines, turned_rays
 from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
 from graphvio.kernel_cache import any_compiled_before, cache_root
@@ -174,7 +175,10 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     if not rig.pairs:
         _track_singles(rig, config, rng)
     if any(camera.line_time_us for camera in rig.cameras):
-        pixels_at_lines(group.left, frame.pixels, frame.points[:, 2], ReadoutMotion.steady(np.eye(4), 1.0))
+        readout = ReadoutMotion.steady(np.eye(4), 1.0)
+        pixels_at_lines(group.left, frame.pixels, np.zeros(len(frame.ids)), readout)
+        if not rig.pairs:
+            turned_rays(group.left, frame.pixels, readout)
     undo_filters(np.frombuffer(bytes(2), dtype=np.uint8).reshape(1, 2), 1, np.zeros((2, 1), dtype=np.uint8))
     common_rows(frame.ids, frame.ids)
     orientations(noise, np.full((1, 2), 20.0))
@@ -209,6 +213,10 @@ def _warm_up_motion(rig: Rig, config: Config) -> None:
     motion = searched_and_refined(arrays, observations, np.eye(4), config.motion, rng)
     warm_up_extrinsic_monitor(motion)
     by_depth_errors(arrays, observations, motion.inlier, np.eye(4))
+    if any(camera.line_time_us for camera in rig.cameras):
+        derivatives_by_velocities(
+            arrays, observations, motion.inlier, np.eye(4), config.motion.pixel_sigma_px, np.zeros((2, _POINTS))
+        )
     if rig.pairs and rig.singles:
         camera_motions(motion.cur_T_ref, arrays)
         of_single = np.full(_POINTS, len(rig.pairs))

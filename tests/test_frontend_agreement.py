@@ -124,7 +124,8 @@ def test_doubt_lasts_a_second() -> None:
     sides = {}
     for milliseconds, seen in ((0, slightly), (500, plainly), (1450, slightly), (1550, slightly)):
         frames = {0: TrackedFrame.empty()}
-        tracked = TrackedFrameset(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
+        correspondences = Correspondences(seen, {}, {})
+        tracked = TrackedFrameset(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, correspondences, None)
         agreement, _ = frontend._estimate_motion(tracked, lambda _: STILL)
         assert agreement is not None
         sides[milliseconds] = len(agreement.hypotheses)

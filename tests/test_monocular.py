@@ -397,7 +397,9 @@ def problem(
     landmark_ids = LandmarkIds(len(rig.singles), n_keyframes)
     views = [landmark_ids.join(tracks.camera_tracks(t, 0.3)) for t in times]
     structure, places, _ = landmarks.structure(views, states.poses, cameras)
-    places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, True)
+    places = located(
+        states.poses, states.velocities, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, True
+    )
     measured = Measurements(cameras, structure, PIXEL_SIGMA_PX, samples, np.zeros(0, dtype=np.int64))
     return Problem(measured, states, places, prior)
 
@@ -412,10 +414,12 @@ def at_best(measured: Measurements, states: States, landmarks: Float) -> tuple[F
     """Return Hessian, gradient and cost of poses and cameras, with the landmarks at their best places."""
     cameras = states.cameras(measured.cameras)
     for _ in range(20):
-        landmarks = located(states.poses, cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, True)
+        landmarks = located(
+            states.poses, states.velocities, cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, True
+        )
     eliminated = Eliminated.empty(measured.structure, states.n_camera_parameters)
     return visual_equations(
-        states.poses, cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, 1e4, eliminated
+        states.poses, states.velocities, cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, 1e4, eliminated
     )[:3]
 
 
@@ -486,11 +490,17 @@ def test_a_lens_that_is_wrong_by_the_file_moves_rays_as_its_derivatives_say(mode
     (by_file, _), (by_other, _) = camera.unproject(pixels), moved.unproject(pixels)
     for seen, expected in zip(by_file, by_other, strict=True):
         structure = Structure(
-            np.eye(4)[None], np.array([0, 1]), np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64), seen[None]
+            np.eye(4)[None],
+            np.array([0, 1]),
+            np.zeros(1, dtype=np.int64),
+            np.zeros(1, dtype=np.int64),
+            seen[None],
+            np.zeros((1, 4)),
         )
         landmark = np.array([[expected[0], expected[1], 0.2]])
         errors2 = visual_equations(
             np.eye(4)[None],
+            np.zeros((1, 3)),
             Cameras.of(rig).moved(change),
             landmark,
             structure,
@@ -607,12 +617,22 @@ def test_landmarks_that_were_held_move_along_with_the_keyframes_to_where_they_ar
     def error2(frames: Float, places: Float, at_best: bool) -> float:
         structure = measured.structure._replace(odom_T_landmark=frames)
         for _ in range(10 if at_best else 0):
-            places = located(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, True)
+            places = located(
+                changed.poses, changed.velocities, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, True
+            )
         none = Eliminated.empty(structure)
         return float(
-            visual_equations(changed.poses, cameras, places, structure, PIXEL_SIGMA_PX, PRIOR_INFORMATION, 1e4, none)[
-                3
-            ].sum()
+            visual_equations(
+                changed.poses,
+                changed.velocities,
+                cameras,
+                places,
+                structure,
+                PIXEL_SIGMA_PX,
+                PRIOR_INFORMATION,
+                1e4,
+                none,
+            )[3].sum()
         )
 
     frames, places = held.moved_along(changed)
@@ -847,7 +867,15 @@ def in_odom(frames: Float, landmarks: Float) -> Float:
 def visual_cost(measured: Measurements, states: States, landmarks: Float, eliminated: Eliminated) -> float:
     return float(
         visual_equations(
-            states.poses, measured.cameras, landmarks, measured.structure, 2.0, PRIOR_INFORMATION, 1e4, eliminated
+            states.poses,
+            states.velocities,
+            measured.cameras,
+            landmarks,
+            measured.structure,
+            2.0,
+            PRIOR_INFORMATION,
+            1e4,
+            eliminated,
         )[2]
     )
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from recordings import half_size, half_size_rig, small_rig
@@ -11,19 +12,34 @@ from rendered import rendered_once
 from graphvio import Odometry, Rig, RigError, Trajectory, load_trajectory, open_source
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
+from graphvio.backend.readout_factor import readout_factor
 from graphvio.config import Config
 from graphvio.evaluation import evaluate
 from graphvio.frontend.depth.stereo import triangulate
 from graphvio.frontend.depth.tracks import TrackedFrame
-from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines, pixels_at_stamp
-from graphvio.geometry import se3, se3_inverse, so3_exp
+from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
+from graphvio.frontend.motion.refinement import refine
+from graphvio.frontend.tracking.measured_readouts import MeasuredReadouts
+from graphvio.frontend.tracking.rolling_shutter import (
+    ReadoutMotion,
+    as_at_stamp,
+    pixels_at_lines,
+    pixels_at_stamp,
+    turned_rays,
+)
+from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.measurements.motion import ByVelocities, RelativeMotion
 from graphvio.measurements.sensors import FrameSet, ImuSample
+from graphvio.monocular.equations import visual_equations
+from graphvio.monocular.reprojection import Cameras
+from graphvio.monocular.structure import Eliminated, Structure
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Camera, SingleCamera
 from graphvio.simulation import Simulator, build_scene, write_recording
-from graphvio.simulation.named_rigs import stereo
+from graphvio.simulation.named_rigs import phone, stereo
 
-DURATION_S, READOUT_US = 3.0, 20e3
+DURATION_S, READOUT_US = 5.0, 20e3
 MOTION = ReadoutMotion(
     np.array([0.8, -1.5, 1.1]), np.array([0.9, -0.4, 0.3]), np.array([4.0, 2.0, -3.0]), np.array([-2.0, 3.0, 1.0])
 )
@@ -166,6 +182,147 @@ def test_line_times_that_make_no_sense_are_refused() -> None:
         replace(rig.pairs[0], right=rolling(rig.pairs[0].right))
 
 
+def test_velocities_are_those_of_measured_motions() -> None:
+    """Between two framesets a quadratic motion's are exact; at the newest one with the IMU's acceleration."""
+    step_ns = 50_000_000
+    poses = [body_at(1e-9 * step_ns * k) for k in (-1, 0, 1)]
+    now = poses[2][:3, :3]
+    by_imu = replace(MOTION, velocity=np.zeros(3), acceleration=now.T @ MOTION.acceleration, is_by_imu=True)
+    true = now.T @ (MOTION.velocity + 1e-9 * step_ns * MOTION.acceleration)
+    for known, is_newest_exact in ((by_imu, True), (None, False)):
+        readouts = MeasuredReadouts(20_000_000)
+        assert readouts.at(0) is None
+        readouts.note(-step_ns, 0, se3_inverse(poses[0]) @ poses[1], None)
+        readouts.note(0, step_ns, poses[2], known)
+        between, newest = readouts.at(0), readouts.at(step_ns)
+        assert between is not None
+        assert newest is not None
+        np.testing.assert_allclose(between.velocity, MOTION.velocity, atol=1e-9)
+        np.testing.assert_allclose(between.angular_velocity, MOTION.angular_velocity, atol=5e-3)
+        assert (np.abs(newest.velocity - true).max() < 1e-9) == is_newest_exact
+        assert newest.is_by_imu == is_newest_exact
+        assert newest.velocity_covariance is not None
+        assert np.linalg.norm(newest.velocity - true) < 3.0 * np.sqrt(np.trace(newest.velocity_covariance))
+
+
+def test_velocities_are_not_those_of_framesets_within_two_readouts() -> None:
+    readouts = MeasuredReadouts(30_000_000)
+    readouts.note(0, 33_000_000, body_at(0.033), None)
+    assert readouts.at(33_000_000) is None
+    readouts.note(0, 66_000_000, body_at(0.066), None)
+    assert readouts.at(66_000_000) is not None
+
+
+def compensated(rig: Rig, points: Float, velocity_error: Float) -> tuple[Float, Float, Float]:
+    """Points (N, 3) ``[x, y, 1/Z]`` of the left camera at the stamp by a wrong velocity, right rays, and line times."""
+    pair, motion = rig.pairs[0], replace(MOTION, velocity=MOTION.velocity + velocity_error)
+    rays = []
+    for camera in pair.left, pair.right:
+        pixels, depths = seen(camera, points)
+        rays.append(camera.unproject(pixels_at_stamp(camera, pixels, depths, motion)[0])[0])
+        if camera is pair.left:
+            lines = pixels[:, 1]
+    found, _, _ = triangulate(rays[0], rays[1], pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
+    return found, rays[1], 1e-6 * pair.left.line_time_us * lines
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["now", "reference"])
+def test_wrong_velocities_change_a_motion_as_its_derivatives_say(which: int) -> None:
+    rig = half_size_rig().with_cameras(rolling)
+    points, error = scene(rig), np.array([0.03, -0.02, 0.04])
+    cur_T_ref = se3(so3_exp(np.array([0.02, -0.01, 0.03])), np.array([0.05, 0.02, -0.03]))
+    now, right, seconds_now = compensated(rig, points, error if which == 0 else np.zeros(3))
+    then = points @ cur_T_ref[:3, :3] - cur_T_ref[:3, 3] @ cur_T_ref[:3, :3]  # where the points are at the reference
+    reference, _, seconds_then = compensated(rig, then, error if which == 1 else np.zeros(3))
+    n = len(points)
+    covariances = np.tile(1e-8 * np.eye(3), (n, 1, 1))
+    everything = np.ones(n, dtype=bool)
+    observations = Observations(
+        np.zeros(n, dtype=np.int64), reference, covariances, np.ascontiguousarray(now[:, :2]), right, everything
+    )
+    arrays, config = RigArrays.of(rig), Config().motion
+    refined = refine(arrays, observations, cur_T_ref, config)
+    assert refined.inlier.all()
+    measured = se3_log(np.ascontiguousarray(se3_inverse(refined.cur_T_ref @ se3_inverse(cur_T_ref))))
+    derivatives = derivatives_by_velocities(
+        arrays,
+        observations,
+        everything,
+        refined.cur_T_ref,
+        config.pixel_sigma_px,
+        np.array([seconds_now, seconds_then]),
+    )
+    expected = -derivatives[which] @ error  # the true velocity is less than the one that was used
+    assert np.linalg.norm(measured[3:]) > 3e-4
+    assert np.linalg.norm(measured - expected) < 0.1 * np.linalg.norm(measured)
+
+
+def by_velocities() -> ByVelocities:
+    random = np.random.default_rng(3)
+    derivatives = 0.03 * random.normal(size=(2, 6, 3))
+    return ByVelocities(random.normal(size=(2, 3)), derivatives, np.tile(0.01 * np.eye(3), (2, 1, 1)))
+
+
+def test_factor_of_a_motion_has_the_derivatives_of_its_error() -> None:
+    random = np.random.default_rng(4)
+    keys, velocities = [gtsam.symbol("x", k) for k in (0, 1)], [gtsam.symbol("v", k) for k in (1, 0)]
+    values = gtsam.Values()
+    poses = [se3(so3_exp(random.normal(size=3)), random.normal(size=3)) for _ in range(2)]
+    for key, pose in zip(keys, poses, strict=True):
+        values.insert(key, gtsam.Pose3(pose))
+    dependence = by_velocities()
+    for k, key in enumerate(velocities):
+        values.insert(key, poses[1 - k][:3, :3] @ dependence.used[k])
+    motion = RelativeMotion(
+        0, 1, se3_inverse(poses[0]) @ poses[1], np.eye(6), np.zeros((6, 6)), 50, by_velocities=dependence
+    )
+    factor = readout_factor(keys[0], keys[1], (velocities[0], velocities[1]), motion, gtsam.noiseModel.Unit.Create(6))
+    np.testing.assert_allclose(factor.unwhitenedError(values), np.zeros(6), atol=1e-9)
+    system, _ = factor.linearize(values).jacobian()
+    sizes = [6, 6, 3, 3]
+    for column, derivative in enumerate(system.T):
+        errors = []
+        for step in (1e-6, -1e-6):
+            change, parts = gtsam.VectorValues(), np.split(step * np.eye(18)[column], np.cumsum(sizes)[:-1])
+            for key, part in zip([*keys, *velocities], parts, strict=True):
+                change.insert(key, part)
+            errors.append(factor.unwhitenedError(values.retract(change)))
+        np.testing.assert_allclose((errors[0] - errors[1]) / 2e-6, derivative, atol=1e-6)
+
+
+def test_covariance_with_any_velocity_has_that_of_the_velocities() -> None:
+    dependence = by_velocities()
+    motion = RelativeMotion(0, 1, np.eye(4), 1e-6 * np.eye(6), 1e-8 * np.eye(6), 50, by_velocities=dependence)
+    whole = motion.with_any_velocity()
+    assert whole.by_velocities is None
+    now, then = (each @ each.T * 0.01 for each in dependence.derivatives)
+    np.testing.assert_allclose(whole.covariance, motion.covariance + now + then)
+    np.testing.assert_allclose(whole.shared_covariance, motion.shared_covariance + then)
+    assert replace(motion, by_velocities=None).with_any_velocity().covariance is motion.covariance
+
+
+def test_views_of_a_single_camera_are_from_where_its_lines_see_them() -> None:
+    """The reprojection errors are zero by the velocity of the state, whatever depth was known when it was seen."""
+    rig = half_size_rig().with_cameras(rolling)
+    camera, points = rig.pairs[0].left, scene(rig)
+    single = Rig((), rig.imu, singles=(SingleCamera(camera),))
+    pixels, _ = seen(camera, points)
+    rays, readout = turned_rays(camera, pixels, replace(MOTION, velocity=np.zeros(3)))
+    in_cam, n = points @ camera.cam_T_body[:3, :3].T + camera.cam_T_body[:3, 3], len(points)
+    landmarks = np.column_stack([in_cam[:, :2] / in_cam[:, 2:], 1.0 / in_cam[:, 2]])
+    zero = np.zeros(n, dtype=np.int64)
+    structure = Structure(np.tile(camera.body_T_cam, (n, 1, 1)), np.arange(n + 1), zero, zero, rays, readout)
+    errors2 = [
+        visual_equations(
+            np.eye(4)[None], velocity[None], Cameras.of(single), landmarks, structure, 0.3, 0.0, 1e4,
+            Eliminated.empty(structure),
+        )[3]
+        for velocity in (MOTION.velocity, np.zeros(3))
+    ]  # fmt: skip
+    assert errors2[0].max() < 1e-6
+    assert np.median(errors2[1]) > 1.0
+
+
 @pytest.fixture(scope="module")
 def walk() -> Path:
     def write(folder: Path) -> None:
@@ -175,11 +332,13 @@ def walk() -> Path:
     return rendered_once("room-rolling", write, "320x240", DURATION_S)
 
 
-def ate_m(walk: Path, rig: Rig) -> float:
+def ate_m(walk: Path, rig: Rig, begin_s: float = 0.0) -> float:
     source = open_source(walk, rig)
     assert source.truth is not None
-    odometry = Odometry(source.rig)
-    estimates = [each for each in map(odometry.process, source) if each is not None] + odometry.finish()
+    odometry, truth = Odometry(source.rig), load_trajectory(source.truth)
+    begin_ns = int(truth.stamps_ns[0]) + round(1e9 * begin_s)
+    measured = [each for each in source if each.stamp_ns >= begin_ns]
+    estimates = [each for each in map(odometry.process, measured) if each is not None] + odometry.finish()
     posed = [each for each in estimates if each.nav_T_body is not None]
     poses: Float = np.array([each.nav_T_body for each in posed])
     estimated = Trajectory(np.array([each.stamp_ns for each in posed], dtype=np.int64), poses)
@@ -190,5 +349,27 @@ def test_the_line_time_in_the_rig_restores_the_accuracy(walk: Path) -> None:
     rig = open_source(walk).rig
     known = ate_m(walk, rig)
     assert known < 0.002
-    assert ate_m(walk, rig.without_imu()) < 0.01  # by constant velocity
+    assert ate_m(walk, rig.without_imu()) < 0.002
     assert ate_m(walk, rig.with_cameras(lambda camera: replace(camera, line_time_us=0.0))) > 5.0 * known
+
+
+def test_a_walk_that_begins_in_motion_is_as_accurate_as_one_from_a_standstill(walk: Path) -> None:
+    """The velocity of the first framesets is not known, and points of theirs are seen for long."""
+    rig = open_source(walk).rig
+    assert ate_m(walk, rig, 2.0) < 0.0008
+    assert ate_m(walk, rig.without_imu(), 2.0) < 0.002
+
+
+def test_a_single_camera_is_as_accurate_with_a_rolling_shutter() -> None:
+    """From motion on, with landmarks whose distance is not known when they are seen first."""
+    ates_m = []
+    for line_time_us in (0.0, READOUT_US / 240):
+        small = phone().with_cameras(half_size)
+        rig = replace(small, singles=(SingleCamera(replace(small.cameras[0], line_time_us=line_time_us)),))
+
+        def write(folder: Path, rig: Rig = rig) -> None:
+            write_recording(Simulator(build_scene("room", 6.0), rig, 1), folder)
+
+        walk = rendered_once(f"room-phone-{line_time_us:.0f}", write, "320x240", 6.0)
+        ates_m.append(ate_m(walk, open_source(walk).rig, 1.0))
+    assert ates_m[1] < 1.5 * ates_m[0]

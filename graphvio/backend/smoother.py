@@ -31,6 +31,7 @@ from graphvio.backend.factors import (
 from graphvio.backend.gating import excess, gate_innovation, gate_motion, relative_covariance
 from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
+from graphvio.backend.readout_factor import corrected, jacobians_of, readout_factor
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity, tilt_covariance
 from graphvio.backend.window import SOLVER_ERRORS, GraphWindow
@@ -38,7 +39,7 @@ from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.motion import ByVelocities, RelativeMotion
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
@@ -70,6 +71,7 @@ class Smoother:
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._seen_ns: int | None = None  # the same, by vision
         self._nav_covariance = np.zeros((6, 6))  # of nav itself, left of its poses: reported, but not estimated
+        self._has_rolling_shutter = False  # motions depend on the velocities of their references
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
 
     @property
@@ -197,14 +199,29 @@ class Smoother:
         if motion.calibration_covariance is not None:
             covariance = covariance + motion.calibration_covariance
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
-        predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
-        return gate_motion(
-            motion.reference_T_current,
-            covariance,
-            predicted,
-            sigma_scale**2 * relative_covariance(predicted, self._window.joint_covariance([reference, newest])),
-            self._config.gate_probability,
-        )
+        predicted, measured = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns), motion.reference_T_current
+        if motion.by_velocities is None:
+            of_state = relative_covariance(predicted, self._window.joint_covariance([reference, newest]))
+        else:
+            measured, of_state = self._with_velocities(motion, motion.by_velocities, predicted)
+        return gate_motion(measured, covariance, predicted, sigma_scale**2 * of_state, self._config.gate_probability)
+
+    def _with_velocities(
+        self, motion: RelativeMotion, by_velocities: ByVelocities, predicted: Float
+    ) -> tuple[Float, Float]:
+        """Return a motion by the window's velocities (4, 4), and the covariance (6, 6) of what the window predicts."""
+        states = [self.state(motion.stamp_ns), self.state(motion.reference_stamp_ns)]
+        nav_R_body = np.array([state.nav_T_body[:3, :3] for state in states])
+        in_body = np.array([state.nav_T_body[:3, :3].T @ state.velocity_nav for state in states])
+        reference, _ = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
+        joint = self._window.joint_covariance([reference, *self._keys_of_readout(motion)])
+        jacobian = np.hstack(jacobians_of(predicted, by_velocities, nav_R_body, in_body))
+        return corrected(motion, by_velocities, in_body), jacobian @ joint @ jacobian.T
+
+    def _keys_of_readout(self, motion: RelativeMotion) -> tuple[int, int, int]:
+        """Return the keys of the newest pose, and of the velocities that a motion by rolling shutters depends on."""
+        newest, reference = self._index_of[motion.stamp_ns], self._index_of[motion.reference_stamp_ns]
+        return x(newest), v(newest), v(reference)
 
     def gate_zero_velocity(self) -> GateResult:
         """Test the innovation of a velocity of zero."""
@@ -263,14 +280,14 @@ class Smoother:
         k = self._index_of[motion.reference_stamp_ns]
         self._views.add(k, motion, self._window)
         reference, covariance = self._views.seen(k, motion)
-        self._window.add(
-            gtsam.BetweenFactorPose3(
-                reference,
-                x(self._index_of[motion.stamp_ns]),
-                gtsam.Pose3(motion.reference_T_current),
-                robust(gaussian(covariance), self._config.huber_probability),
-            )
-        )
+        noise = robust(gaussian(covariance), self._config.huber_probability)
+        newest, *velocities = self._keys_of_readout(motion)
+        if motion.by_velocities is None:
+            measured = gtsam.Pose3(motion.reference_T_current)
+            self._window.add(gtsam.BetweenFactorPose3(reference, newest, measured, noise))
+        else:
+            self._has_rolling_shutter = True
+            self._window.add(readout_factor(reference, newest, (velocities[0], velocities[1]), motion, noise))
 
     def update(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
         """Update the newest states by the newest factors.
@@ -343,6 +360,8 @@ class Smoother:
         """Return the variables that the next factors will be tied to, or whose covariance will be needed."""
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
         keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]
+        if self._has_rolling_shutter:
+            keys += [v(self._index_of[stamp]) for stamp in stamps]
         newest = self._index_of[self.latest_ns]
         return [*keys, x(newest), v(newest), b(newest), g()] if self.has_imu else [*keys, x(newest)]
 

@@ -11,6 +11,7 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
 from graphvio.frontend.motion.observations import Correspondences
 from graphvio.frontend.thresholds import THRESHOLDS
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stamp
 from graphvio.rig import Rig
 
 _T = THRESHOLDS.reference
@@ -39,6 +40,12 @@ class References:
     def recalibrate(self, rig: Rig) -> None:
         """Use another calibration of the rig: the references' points are triangulated again."""
         self._frames = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._frames.items()}
+
+    def read_out(self, stamp_ns: int, readout: ReadoutMotion, rig: Rig) -> None:
+        """Compensate the rolling shutters of the references of one stamp by another motion of body."""
+        for j, frame in self._frames.items():
+            if frame.stamp_ns == stamp_ns and rig.groups[j].left.line_time_us:
+                self._frames[j] = as_at_stamp(frame, rig.groups[j], readout)
 
     def clear(self) -> None:
         """Forget all."""

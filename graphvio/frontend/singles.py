@@ -13,6 +13,7 @@ from graphvio.frontend.imaging.images import ImageMask
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking.handover import Handover, Leaving
 from graphvio.frontend.tracking.overlaps import Overlaps
+from graphvio.frontend.tracking.rolling_shutter import turned_rays
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.measurements.motion import CameraTracks, PairReport, Quality, VisualResult
 from graphvio.rig import Rig
@@ -54,7 +55,7 @@ class SinglesFrontend(TrackingFrontend):
         )
         if is_keyframe:
             self._advance_history(seen, motion_since)
-        camera_tracks = self._match_across_cameras(seen.frames, motion_since, is_keyframe)
+        camera_tracks = self._match_across_cameras(seen, motion_since, is_keyframe)
         if is_keyframe:
             seen, camera_tracks = self._begin_keyframe(seen, motion_since)
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
@@ -85,20 +86,21 @@ class SinglesFrontend(TrackingFrontend):
         before = seen.frames
         seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
         new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
-        camera_tracks = self._match_across_cameras(seen.frames, motion_since, True, new)
+        camera_tracks = self._match_across_cameras(seen, motion_since, True, new)
         for j in seen.frames:
             self._overlaps.slant(j, self._trackers[j])
         return seen, camera_tracks
 
     @timed("elsewhere")
     def _match_across_cameras(
-        self, frames: dict[int, TrackedFrame], motion_since: MotionPredictor, searches: bool,
+        self, seen: TrackedFrameset, motion_since: MotionPredictor, searches: bool,
         wanted: Mapping[int, Bool] | None = None,
     ) -> dict[int, CameraTracks]:  # fmt: skip
         """Find each camera's tracks in the other cameras that see the same part of the scene.
 
         Those that another camera's track is a part of are found by that one.
         """
+        frames = seen.frames
         images = {j: self._trackers[j].tracked_image for j in frames}
         of_others = {j: np.zeros(len(frames[j].ids), dtype=bool) for j in frames}
         if not searches:
@@ -108,7 +110,11 @@ class SinglesFrontend(TrackingFrontend):
             chosen = ~of_others[j] if wanted is None else wanted[j]
             self._overlaps.find(j, images, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
             matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
-            rays, _ = self._of_file[j].unproject(frames[j].pixels_at_stamp)
+            camera, pixels = self._of_file[j], frames[j].pixels
+            if camera.line_time_us and seen.readout is not None:
+                rays, readout = turned_rays(camera, pixels, seen.readout)
+                return CameraTracks(frames[j].ids, rays, matches, handed_over, readout)
+            rays, _ = camera.unproject(pixels)
             return CameraTracks(frames[j].ids, rays, matches, handed_over)
 
         return self._in_parallel(find, frames)

@@ -45,6 +45,7 @@ class TrackedFrameset(NamedTuple):
         frames: Pair index -> its tracks.
         reference: Pair index -> its tracks at the reference; empty if there is none.
         correspondences: Points of both.
+        readout: Motion of body while rolling shutters read the images out, or None without these or if unknown.
     """
 
     stamp_ns: int
@@ -52,6 +53,7 @@ class TrackedFrameset(NamedTuple):
     frames: dict[int, TrackedFrame]
     reference: dict[int, TrackedFrame]
     correspondences: Correspondences
+    readout: ReadoutMotion | None
 
     @property
     def reference_stamp_ns(self) -> int:
@@ -208,7 +210,7 @@ class TrackingFrontend(ABC):
         for stage in ("pyramid", "register", "flow", "stereo"):
             self.stage_ms[stage] = max((frame.stage_ms[stage] for frame in frames.values()), default=0.0)
         reference = self._references.shared(frames)
-        return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames))
+        return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames), readout)
 
     def _in_parallel(self, work: Callable[[int], _Result], groups: Iterable[int]) -> dict[int, _Result]:
         """Work on each pair and single camera, in several threads, each of which takes the next one."""

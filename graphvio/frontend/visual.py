@@ -21,6 +21,7 @@ from graphvio.frontend.motion.refinement import Refined
 from graphvio.frontend.motion.selection import best_pair_motion, joint_motion
 from graphvio.frontend.pairs.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.pairs.pair_reports import inliers_of, pair_reports
+from graphvio.frontend.readouts import Readouts
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.geometry import se3_inverse, so3_log
@@ -50,6 +51,7 @@ class VisualFrontend(TrackingFrontend):
 
     Attributes:
         stage_ms: Processing time by stage of the newest frameset, milliseconds.
+        are_velocities_known: Whether those are by which rolling shutters of the newest frameset were compensated.
     """
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
@@ -62,6 +64,8 @@ class VisualFrontend(TrackingFrontend):
         self._scale_sigma = 0.0 if rig.imu is None else error_share
         self._noise_px = config.motion.pixel_sigma_px  # of the last good motion's points
         self._is_reference_of_few = False  # whether the reference began at points too few for a motion
+        self._readouts = Readouts(rig) if self._has_rolling_shutter else None
+        self.are_velocities_known = True
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
 
     @property
@@ -93,6 +97,11 @@ class VisualFrontend(TrackingFrontend):
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset."""
         agreement, reason = self._estimate_motion(seen, motion_since)
+        if self._readouts is not None:
+            if agreement is not None:
+                seen, agreement, reason = self._with_shown_velocities(seen, self._readouts, agreement, motion_since)
+            self._readouts.keep(seen, self._references)
+            self.are_velocities_known = self._readouts.is_known(seen)
         few = self._fit_few_points(seen, motion_since) if agreement is None else None
         judged = self._judge(seen, agreement, reason, motion_since)
         if agreement is not None and judged.quality is Quality.GOOD:
@@ -138,6 +147,20 @@ class VisualFrontend(TrackingFrontend):
         if not is_supported(best.refined.inlier[rows], config):
             return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"
         return agreement, ""
+
+    def _with_shown_velocities(
+        self, seen: TrackedFrameset, readouts: Readouts, agreement: Agreement, motion_since: MotionPredictor
+    ) -> tuple[TrackedFrameset, Agreement | None, str]:
+        """Measure a motion by rolling shutters again with the velocities that it shows, where no state knows them."""
+        readouts.note(seen, agreement.hypotheses[0].refined.cur_T_ref)
+        again = readouts.compensated_by_motion(seen, self._trackers, self._references, self._rig)
+        if again is None:
+            return seen, agreement, ""
+        self._latest.update(again.frames)
+        better, reason = self._estimate_motion(again, motion_since)
+        if better is not None:
+            readouts.note(again, better.hypotheses[0].refined.cur_T_ref)
+        return again, better, reason
 
     @timed("motion")
     def _fit_few_points(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> FewPoints | None:
@@ -280,7 +303,7 @@ class VisualFrontend(TrackingFrontend):
         ref_T_cur = se3_inverse(refined.cur_T_ref)
         scaled = self._scale_covariance(ref_T_cur)
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
-        return RelativeMotion(
+        motion = RelativeMotion(
             seen.reference_stamp_ns,
             seen.stamp_ns,
             ref_T_cur,
@@ -288,6 +311,17 @@ class VisualFrontend(TrackingFrontend):
             np.zeros((6, 6)) if used_once else refined.shared_covariance,
             int(refined.inlier.sum()),
         )
+        return self._with_readout_errors(motion, seen, refined)
+
+    def _with_readout_errors(
+        self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
+    ) -> RelativeMotion:
+        """Add how a motion by rolling shutters depends on the velocities, which only an IMU's state has."""
+        if self._readouts is None:
+            return motion
+        errors = self._readouts.errors(seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px)
+        motion = replace(motion, by_velocities=errors)
+        return motion if seen.readout is not None and seen.readout.is_by_imu else motion.with_any_velocity()
 
     def _scale_covariance(self, ref_T_cur: Float) -> Float:
         """Return the covariance (6, 6) of an error that is a share of a motion's angle and length."""
@@ -306,7 +340,7 @@ class VisualFrontend(TrackingFrontend):
             int(few.inlier.sum()),
             pairs=seen.correspondences.observations.of_rows(few.inlier).pairs,
         )
-        return self._with_depth_errors(motion, seen, few)
+        return self._with_depth_errors(self._with_readout_errors(motion, seen, few), seen, few)
 
     def _with_depth_errors(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import NamedTuple
@@ -53,6 +53,21 @@ class PairReport:
     own_rms_px: float | None = None
 
 
+class ByVelocities(NamedTuple):
+    """How a motion that rolling shutters measure depends on the velocities by which their lines were compensated.
+
+    Attributes:
+        used: (2, 3) m/s, of body at the later instant and at the earlier one, in body there.
+        derivatives: (2, 6, 3) of the motion with respect to the true velocities, tangent
+            ``[rotation, translation]`` in the body frame of the later instant.
+        covariances: (2, 3, 3) of the velocities that were used.
+    """
+
+    used: Float
+    derivatives: Float
+    covariances: Float
+
+
 @dataclass(frozen=True, eq=False)
 class RelativeMotion:
     """A measured motion of the rig.
@@ -69,6 +84,7 @@ class RelativeMotion:
             Zero for pairs that did not measure it, None where errors of pairs are not estimated.
         calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
             where they add nothing. Innovation tests allow for it.
+        by_velocities: Of rolling shutters, for those who estimate the velocities; others use `with_any_velocity`.
         pairs: Indices of the pairs and single cameras whose motion it is, of one of several hypotheses and of a partial
             motion.
     """
@@ -81,7 +97,17 @@ class RelativeMotion:
     inliers: int
     by_depth_errors: Float | None = None
     calibration_covariance: Float | None = None
+    by_velocities: ByVelocities | None = None
     pairs: tuple[int, ...] = ()
+
+    def with_any_velocity(self) -> RelativeMotion:
+        """Return the motion with a covariance that allows for errors of the velocities that rolling shutters need."""
+        if self.by_velocities is None:
+            return self
+        _, derivatives, covariances = self.by_velocities
+        now, then = (each @ covariance @ each.T for each, covariance in zip(derivatives, covariances, strict=True))
+        shared = self.shared_covariance + then if self.shared_covariance.any() else self.shared_covariance
+        return replace(self, covariance=self.covariance + now + then, shared_covariance=shared, by_velocities=None)
 
     @property
     def duration_s(self) -> float:
@@ -124,6 +150,7 @@ class HandedOverTracks(NamedTuple):
     ids: Int
 
 
+GLOBAL_SHUTTER = np.zeros((0, 4))  # rows of `CameraTracks.readout`
 _NONE_HANDED_OVER = HandedOverTracks(*(np.zeros(0, dtype=np.int64) for _ in range(3)))
 
 
@@ -132,15 +159,19 @@ class CameraTracks(NamedTuple):
 
     Attributes:
         ids: (N,) identities of its tracks, increasing.
-        rays: (N, 2) normalised coordinates.
+        rays: (N, 2) normalised coordinates; those of a rolling shutter are as if it had not turned since the stamp.
         matches: the same tracks in other cameras whose views overlap.
         handed_over: which of them follow points of other cameras' tracks.
+        readout: (N, 4) of a rolling shutter, when and from where a line sees: ``[seconds, x, y, z]`` from the stamp to
+            the line's exposure, and the camera's way until then in metres, frame body at the stamp, but for what
+            body's velocity at the stamp adds. (0, 4) of a global shutter.
     """
 
     ids: Int
     rays: Float
     matches: tuple[CrossCameraMatches, ...] = ()
     handed_over: HandedOverTracks = _NONE_HANDED_OVER
+    readout: Float = GLOBAL_SHUTTER
 
 
 class LocatedPoints(NamedTuple):

@@ -95,8 +95,8 @@ def equations(
     n_camera_parameters = states.n_camera_parameters
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, cost, errors2 = visual_equations(
-        states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
-        measured.depth_information, ROBUST_SCALE, eliminated,
+        states.poses, states.velocities, states.cameras(measured.cameras), landmarks, measured.structure,
+        measured.sigma_px, measured.depth_information, ROBUST_SCALE, eliminated,
     )  # fmt: skip
     inertial = inertial_equations(
         measured.samples, InertialStates(states.poses, states.velocities, states.gravity, states.parameters)
@@ -156,8 +156,9 @@ def adjust(
     """
     cameras, n = states.cameras(measured.cameras), len(states.poses)
     landmarks = located(
-        states.poses, cameras, landmarks, measured.structure, measured.sigma_px, measured.depth_information, False
-    )
+        states.poses, states.velocities, cameras, landmarks, measured.structure, measured.sigma_px,
+        measured.depth_information, False,
+    )  # fmt: skip
     at = equations(measured, states, landmarks, prior, file)
     damping = _DAMPING
     for _ in range(max_steps):
@@ -220,9 +221,12 @@ def views_only(
     Returns:
         Information (6 K, 6 K) and gradient (6 K,).
     """
-    landmarks = located(states.poses, cameras, landmarks, structure, sigma_px, PRIOR_INFORMATION, True)
+    landmarks = located(
+        states.poses, states.velocities, cameras, landmarks, structure, sigma_px, PRIOR_INFORMATION, True
+    )
     information, gradient, _, _ = visual_equations(
         states.poses,
+        states.velocities,
         cameras,
         landmarks,
         structure,

@@ -74,6 +74,7 @@ class _Views(NamedTuple):
     firsts: Int  # (L,) first view of each
     rays: Float  # (N, 3) of unit length, in body
     levers: Float  # (N, 3) m, of the cameras in body
+    delays: Float  # (N,) s, of rolling shutters' lines
     weights: Float  # (N,)
 
     @staticmethod
@@ -88,7 +89,9 @@ class _Views(NamedTuple):
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         body_T_cam = cameras.body_T_cam[structure.camera[rows]]
         in_body = np.einsum("nij,nj->ni", body_T_cam[:, :3, :3], rays)
-        return _Views(structure.state[rows], landmark, firsts, in_body, body_T_cam[:, :3, 3], np.ones(len(rows)))
+        levers = body_T_cam[:, :3, 3] + structure.readout[rows, 1:]
+        delays = structure.readout[rows, 0]
+        return _Views(structure.state[rows], landmark, firsts, in_body, levers, delays, np.ones(len(rows)))
 
 
 class _Equations(NamedTuple):
@@ -212,8 +215,12 @@ def _equations(chain: _Chain, views: _Views) -> _Equations:
     """Collect the equations, each weighted, of the views of a motion with given rotations."""
     k, first, weights = views.state, views.firsts[views.landmark], views.weights[:, None, None]
     rays = np.einsum("nij,nj->ni", chain.rotations[k], views.rays)
-    places = chain.positions[k] + np.einsum("nij,nj->ni", chain.rotations[k], views.levers)
-    dt, dt2 = chain.times[k[first]] - chain.times[k], 0.5 * (chain.times[k[first]] ** 2 - chain.times[k] ** 2)
+    delays, times = views.delays, chain.times[k] + views.delays
+    places = chain.positions[k] + delays[:, None] * chain.velocities[k]
+    places += np.einsum("nij,nj->ni", chain.rotations[k], views.levers)
+    # A line moves on at the stamp's velocity; its acceleration is in the lever.
+    times2 = times**2 - delays**2
+    dt, dt2 = times[first] - times, 0.5 * (times2[first] - times2)
     across = weights * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
     metre = np.einsum("nij,nj->ni", across, places[first] - places)[:, :, None]
     by_motion = np.concatenate([across * dt[:, None, None], across * dt2[:, None, None], metre], axis=2)

@@ -69,13 +69,14 @@ def _new_sums(n_poses: int, n_cameras: int, n_calibration: int) -> _Sums:
 
 @vector_kernel
 def visual_equations(
-    poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, depth_information: float,
-    scale: float, eliminated: Eliminated,
+    poses: Float, velocities: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
+    depth_information: float, scale: float, eliminated: Eliminated,
 ) -> tuple[Float, Float, float, Float]:  # fmt: skip
     """Linearise the reprojection errors, with the landmarks eliminated.
 
     Args:
         poses: (K, 4, 4) ``odom_T_body``; perturbed on the right, ``R Exp(r)``, ``p + R t``.
+        velocities: (K, 3) m/s, frame odom, by which rolling shutters move on.
         cameras: that see the landmarks.
         landmarks: (L, 3).
         structure: of these.
@@ -109,8 +110,8 @@ def visual_equations(
         for n in range(first, last):
             k, j = structure.state[n], structure.camera[n]
             in_front = is_possible and whiten_view(
-                poses[k], cameras, j, structure.odom_T_landmark[point], landmarks[point], structure.rays[n], sigma_px,
-                True, by_lens, rows,
+                poses[k], velocities[k], cameras, j, structure.odom_T_landmark[point], landmarks[point],
+                structure.rays[n], structure.readout[n], sigma_px, True, by_lens, rows,
             )  # fmt: skip
             u, v = rows[0], rows[1]
             e2 = u[ERROR_AT] * u[ERROR_AT] + v[ERROR_AT] * v[ERROR_AT] if in_front else _ERROR2_BEHIND

@@ -161,7 +161,9 @@ class Initialiser:
                 self.reason = f"only {len(ids)} points stand still"
                 self._fits_no_motion = True
                 return None
-            places = located(states.poses, cameras, places, structure, self._sigma_px, PRIOR_INFORMATION, True)
+            places = located(
+                states.poses, states.velocities, cameras, places, structure, self._sigma_px, PRIOR_INFORMATION, True
+            )
             measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
             if file is not None and is_first:
                 measured, states, places = self._roughly_adjusted(measured, states, places, prior, file)

@@ -101,8 +101,8 @@ def _linearised(
     n, n_camera_parameters = len(states.poses), states.n_camera_parameters
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, _, _ = visual_equations(
-        states.poses, states.cameras(measured.cameras), landmarks, measured.structure, measured.sigma_px,
-        measured.depth_information, ROBUST_SCALE, eliminated,
+        states.poses, states.velocities, states.cameras(measured.cameras), landmarks, measured.structure,
+        measured.sigma_px, measured.depth_information, ROBUST_SCALE, eliminated,
     )  # fmt: skip
     size = 9 * n + GRAVITY + BIASES + len(states.calibration)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)

@@ -26,7 +26,7 @@ _MAX_COMPARISONS = 8  # each takes as long as an initialisation
 
 def alone(camera_tracks: Mapping[int, CameraTracks]) -> dict[int, CameraTracks]:
     """Return what each camera sees by itself."""
-    return {j: CameraTracks(tracks.ids, tracks.rays) for j, tracks in camera_tracks.items()}
+    return {j: CameraTracks(tracks.ids, tracks.rays, readout=tracks.readout) for j, tracks in camera_tracks.items()}
 
 
 class OverlapTrust:

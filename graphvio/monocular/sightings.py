@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.measurements.motion import CameraTracks
+from graphvio.measurements.motion import GLOBAL_SHUTTER, CameraTracks
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Structure
 
@@ -30,6 +30,7 @@ class Views(NamedTuple):
         ids: (M,) identities of its tracks.
         landmark: (M,) identities of the landmarks.
         rays: (M, 2) normalised coordinates.
+        readout: (M, 4) see `graphvio.measurements.motion.CameraTracks`; zero of global shutters.
         is_adopted: (M,) whether the track follows a point that another camera's track began.
     """
 
@@ -38,6 +39,7 @@ class Views(NamedTuple):
     ids: Int
     landmark: Int
     rays: Float
+    readout: Float
     is_adopted: Bool
 
     def without(self, landmarks: Int) -> Views:
@@ -63,11 +65,11 @@ class Views(NamedTuple):
             return self
         return Views(
             self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept],
-            np.compress(kept, self.rays, axis=0), self.is_adopted[kept],
+            np.compress(kept, self.rays, axis=0), np.compress(kept, self.readout, axis=0), self.is_adopted[kept],
         )  # fmt: skip
 
 
-_NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)), np.zeros(0, dtype=bool))
+_NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)), GLOBAL_SHUTTER, np.zeros(0, dtype=bool))
 
 
 class LandmarkIds:
@@ -104,11 +106,15 @@ class LandmarkIds:
             named, own, rank = landmarks[begin : begin + n], np.full(n, j, dtype=np.int64), np.zeros(n, dtype=np.int64)
             rank[tracks.handed_over.rows] = 2
             begin += n
-            parts.append(Views(own, own, tracks.ids, named, tracks.rays, rank > 0))
+            readout = tracks.readout if len(tracks.readout) else np.zeros((n, 4))
+            parts.append(Views(own, own, tracks.ids, named, tracks.rays, readout, rank > 0))
             ranks.append(rank)
             for seen in tracks.matches:
                 rows, other = seen.rows, np.full(len(seen.rows), seen.camera, dtype=np.int64)
-                parts.append(Views(other, own[rows], tracks.ids[rows], named[rows], seen.rays, rank[rows] > 0))
+                is_adopted, global_shutter = rank[rows] > 0, np.zeros((len(rows), 4))
+                parts.append(
+                    Views(other, own[rows], tracks.ids[rows], named[rows], seen.rays, global_shutter, is_adopted)
+                )
                 ranks.append(rank[rows] + 1)
         views = Views(*(np.concatenate(each) for each in zip(*parts, strict=True)))
         return views.once(np.concatenate(ranks))
@@ -187,7 +193,7 @@ class Landmarks:
         landmark = np.concatenate([each.landmark for each in views])
         state = np.concatenate([np.full(len(each.landmark), k) for k, each in enumerate(views)])
         camera = np.concatenate([each.camera for each in views])
-        rays = np.concatenate([each.rays for each in views])
+        rays, readout = (np.concatenate([getattr(each, name) for each in views]) for name in ("rays", "readout"))
         order = np.argsort((landmark * len(views) + state) * len(cameras.body_T_cam) + camera)  # these are unique
         landmark = landmark[order]
         bounds = np.flatnonzero(np.diff(landmark, prepend=-1, append=-1))
@@ -196,7 +202,8 @@ class Landmarks:
         ids = landmark[bounds[:-1][seen_twice]]
         order = order[np.repeat(seen_twice, counts)]
         bounds = np.r_[0, np.cumsum(counts[seen_twice])]
-        state, camera, rays = state[order], camera[order], np.take(rays, order, axis=0)
+        state, camera = state[order], camera[order]
+        rays, readout = np.take(rays, order, axis=0), np.take(readout, order, axis=0)
         firsts = bounds[:-1]
         frames = (poses[:, None] @ cameras.body_T_cam)[state[firsts], camera[firsts]]
         places = np.column_stack([rays[firsts], np.full(len(ids), PRIOR_INVERSE_DEPTH)])
@@ -205,7 +212,7 @@ class Landmarks:
             known = self._ids[at] == ids
             frames[known], places[known] = self._frames[at[known]], self._places[at[known]]
         self._ids, self._frames, self._places = ids, frames, places
-        return Structure(frames, bounds, state, camera, rays), places, ids
+        return Structure(frames, bounds, state, camera, rays, readout), places, ids
 
     def put(self, ids: Int, frames: Float, places: Float) -> None:
         """Set new frames (L, 4, 4) of landmarks (L,) that were last collected, and their places (L, 3) there."""

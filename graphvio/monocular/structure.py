@@ -40,6 +40,7 @@ class Structure(NamedTuple):
         state: (N,) index of the state.
         camera: (N,) index of the camera.
         rays: (N, 2) normalised coordinates.
+        readout: (N, 4) see `graphvio.measurements.motion.CameraTracks`; zero of global shutters.
     """
 
     odom_T_landmark: Float
@@ -47,12 +48,13 @@ class Structure(NamedTuple):
     state: Int
     camera: Int
     rays: Float
+    readout: Float
 
     def of(self, kept: Bool) -> "Structure":
         """Return those of the landmarks (L,) that are kept."""
         rows, begins = rows_of(self.rows, kept)
-        rays = np.compress(rows, self.rays, axis=0)
-        return Structure(self.odom_T_landmark[kept], begins, self.state[rows], self.camera[rows], rays)
+        rays, readout = np.compress(rows, self.rays, axis=0), np.compress(rows, self.readout, axis=0)
+        return Structure(self.odom_T_landmark[kept], begins, self.state[rows], self.camera[rows], rays, readout)
 
 
 class Eliminated(NamedTuple):
@@ -118,8 +120,8 @@ def landmarks_after(
 
 @kernel
 def located(
-    poses: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float, depth_information: float,
-    everywhere: bool,
+    poses: Float, velocities: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
+    depth_information: float, everywhere: bool,
 ) -> Float:  # fmt: skip
     """Return the landmarks (L, 3) with those of few views, or all, located again for poses that stay."""
     moved, rows = landmarks.copy(), np.zeros((2, COLUMNS))
@@ -135,10 +137,10 @@ def located(
                 for d in range(3):
                     v[c, d] = depth_information if c == 2 and d == 2 else 0.0
             for n in range(first, last):
-                j = structure.camera[n]
+                k, j = structure.state[n], structure.camera[n]
                 if not whiten_view(
-                    poses[structure.state[n]], cameras, j, structure.odom_T_landmark[point], moved[point],
-                    structure.rays[n], sigma_px, False, by_lens, rows,
+                    poses[k], velocities[k], cameras, j, structure.odom_T_landmark[point], moved[point],
+                    structure.rays[n], structure.readout[n], sigma_px, False, by_lens, rows,
                 ):  # fmt: skip
                     continue
                 for c in range(3):

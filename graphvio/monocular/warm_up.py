@@ -34,9 +34,16 @@ def warm_up_keyframe_window(rig: Rig) -> None:
     prior = first_prior(states, np.ones(6), np.zeros(6), POSE_SIGMAS)
     cameras = Cameras.of(rig)
     structure = Structure(
-        np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros(2, dtype=np.int64), np.zeros((2, 2))
+        np.eye(4)[None],
+        np.array([0, 2]),
+        np.array([0, 1]),
+        np.zeros(2, dtype=np.int64),
+        np.zeros((2, 2)),
+        np.zeros((2, 4)),
     )
-    places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, PRIOR_INFORMATION, True)
+    places = located(
+        states.poses, states.velocities, cameras, np.zeros((1, 3)), structure, 1.0, PRIOR_INFORMATION, True
+    )
     measured = Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64))
     adjust(measured, states, places, prior, max_steps=1, converged=0.0)
     cameras.moved(np.zeros(SINGLE * len(rig.singles)))

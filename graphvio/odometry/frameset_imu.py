@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from graphvio.arrays import Float
@@ -20,6 +22,8 @@ from graphvio.odometry.imu_clock import ImuClock
 from graphvio.odometry.imu_watch import ImuWatch
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
+
+_MAX_VELOCITY_SIGMA_M_S = 0.1  # beyond, images measure it better
 
 
 class FramesetImu:
@@ -167,7 +171,11 @@ class FramesetImu:
         state = self._estimator.state()
         body_R_nav = state.nav_T_body[:3, :3].T
         acceleration = interval.mean_force - state.accel_bias + body_R_nav @ state.gravity_nav
-        return ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
+        readout = ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
+        covariance = self._estimator.covariance.velocity
+        if covariance is None or np.linalg.eigvalsh(covariance)[-1] > _MAX_VELOCITY_SIGMA_M_S**2:
+            return readout
+        return replace(readout, velocity_covariance=body_R_nav @ covariance @ body_R_nav.T)
 
     def shows_standstill(self, interval: ImuInterval | None) -> bool:
         """Whether the IMU shows a standstill; True while no IMU is used, False where samples are missing."""

@@ -455,16 +455,17 @@ class Odometry:
             keyframe = keyframe_of(frameset, self._frontend, estimator, self._nav, self._keyframe_ns)
             self._keyframe_ns = frameset.stamp_ns
         candidate = visual.motion if visual.quality is Quality.GOOD else None
+        motion, partial_motion = applied.motion or candidate, applied.partial_motion
         step = Step(
             estimate,
-            motion=candidate if applied.motion is None else applied.motion,
+            motion=None if motion is None else motion.with_any_velocity(),
             used=applied.motion is not None,
             interval=interval,
             initialised=estimator.initialisations != predicted.initialisations,
             references=references,
             own={} if applied.motion is None else visual.own,
             keyframe=keyframe,
-            partial_motion=applied.partial_motion,
+            partial_motion=None if partial_motion is None else partial_motion.with_any_velocity(),
         )
         for on_step in self._on_step:
             on_step(step)

@@ -134,7 +134,7 @@ class PairsCalibration:
         # Until the calibration is trusted, motions may be refused because of it.
         is_refused = status is Status.COASTING and not calibration.is_trusted
         is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
-        if not (is_usable or is_urgent):
+        if not (is_usable or is_urgent) or not self._frontend.are_velocities_known:
             return
         views = views_at(self._frontend, stamp_ns)
         tolerant = self._imu_fault_tolerant

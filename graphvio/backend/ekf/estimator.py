@@ -190,7 +190,7 @@ class FilterEstimator:
                 )
             motion = None
         is_seen = motion is not None
-        rates = None if motion is None else VisualRates.of(motion)
+        rates = None if motion is None else VisualRates.of(motion.with_any_velocity())
         candidates: list[Measurement] = []
         if motion is not None and rates is not None and self._passes_as_vision(motion, rates):
             candidates.append(vision(self._running.state, rates))

@@ -31,12 +31,16 @@ class ReadoutMotion:
         velocity: (3,) m/s at the image's stamp, frame body at that instant.
         angular_acceleration: (3,) rad/s^2, frame body.
         acceleration: (3,) m/s^2, frame body at the stamp.
+        velocity_covariance: (3, 3) of the velocity, (m/s)^2, or None where it is but a guess.
+        is_by_imu: Whether an IMU has measured turn and acceleration.
     """
 
     angular_velocity: Float
     velocity: Float
     angular_acceleration: Float = field(default_factory=lambda: np.zeros(3))
     acceleration: Float = field(default_factory=lambda: np.zeros(3))
+    velocity_covariance: Float | None = None
+    is_by_imu: bool = False
 
     @staticmethod
     def accelerated(interval: ImuInterval, gyro_bias: Float, velocity: Float, acceleration: Float) -> ReadoutMotion:
@@ -46,7 +50,7 @@ class ReadoutMotion:
         between_s = seconds - 0.5 * (steps_s[0] + steps_s[-1])  # from the middle of the first step to that of the last
         angular_acceleration = (rates[-1] - rates[0]) / between_s if between_s > 0.5 * seconds else np.zeros(3)
         first_rate = steps_s @ rates / seconds - 0.5 * seconds * angular_acceleration
-        return ReadoutMotion(first_rate, velocity, angular_acceleration, acceleration)
+        return ReadoutMotion(first_rate, velocity, angular_acceleration, acceleration, is_by_imu=True)
 
     @staticmethod
     def steady(cur_T_prev: Float, seconds: float) -> ReadoutMotion:
@@ -90,11 +94,31 @@ def pixels_at_lines(camera: Camera, pixels: Float, inverse_depths: Float, motion
     return seen, depths
 
 
+def turned_rays(camera: Camera, pixels: Float, motion: ReadoutMotion) -> tuple[Float, Float]:
+    """Return the rays of pixels as if the camera had not turned since the stamp, and from where it has seen them.
+
+    The depth of a point is not needed for that: it says how its ray moves with the camera's place.
+
+    Args:
+        camera: with a rolling shutter.
+        pixels: (N, 2) as seen.
+        motion: of body.
+
+    Returns:
+        Normalised coordinates (N, 2), and the rows (N, 4) of `graphvio.measurements.motion.CameraTracks.readout`.
+    """
+    rays, _ = camera.unproject(pixels)
+    return _turned(rays, 1e-6 * camera.line_time_us * pixels[:, 1], *_columns(motion), camera.body_T_cam)
+
+
 def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) -> TrackedFrame:
     """Return a frame whose points are as global shutters would have seen them at the stamp; pixels stay.
 
-    The cameras of a pair have seen a point at nearly one instant, so that its depth is known before.
+    The cameras of a pair have seen a point at nearly one instant, so that its depth is known before. A frame may be
+    compensated again, by another motion.
     """
+    if frame.shutter_px.any():  # back to where the lines have seen the points
+        frame = replace(frame, shutter_px=np.zeros_like(frame.shutter_px)).recalibrated(group)
     depths = np.where(frame.has_depth, np.maximum(frame.points[:, 2], 0.0), 0.0)
     left_px, depths_then = pixels_at_stamp(group.left, frame.pixels, depths, motion)
     shutter_px = np.zeros((len(frame.ids), 2, 2))
@@ -113,6 +137,21 @@ def _columns(motion: ReadoutMotion) -> tuple[Float, Float]:
     """Return turn and shift as polynomials of time, (2, 3) each: the linear and the quadratic coefficients."""
     turns = np.array([motion.angular_velocity, 0.5 * motion.angular_acceleration])
     return turns, np.array([motion.velocity, 0.5 * motion.acceleration])
+
+
+@kernel
+def _turned(rays: Float, times_s: Float, turns: Float, shifts: Float, body_T_cam: Float) -> tuple[Float, Float]:
+    """Turn rays (N, 2) back from times (N,) to the stamp; beside them these times, and the way without velocity."""
+    turned, readout = rays.copy(), np.zeros((len(rays), 4))
+    body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
+    for i in range(len(rays)):
+        t = times_s[i]
+        turn = so3_exp(t * turns[0] + t * t * turns[1])
+        readout[i, 0], readout[i, 1:] = t, t * t * shifts[1] + turn @ lever - lever
+        ray = body_R_cam.T @ (turn @ (body_R_cam @ np.array([rays[i, 0], rays[i, 1], 1.0])))
+        if ray[2] > 1e-6:
+            turned[i] = ray[:2] / ray[2]
+    return turned, readout
 
 
 @kernel

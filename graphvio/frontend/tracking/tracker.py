@@ -359,6 +359,12 @@ class GroupTracker:
         ).keep(has_ray)
         return frame if self._readout is None else as_at_stamp(frame, self._group, self._readout)
 
+    def read_out(self, readout: ReadoutMotion) -> TrackedFrame:
+        """Compensate rolling shutters of the newest frame by another motion of body than it was followed by."""
+        if self._group.left.line_time_us:
+            self._readout, self._last = readout, as_at_stamp(self._last, self._group, readout)
+        return self._last
+
     @property
     def _min_gradient(self) -> float:
         """Smallest rms gradient along a patch's weaker direction; for pure noise it is 0.7 of the noise's deviation."""

@@ -1,0 +1,105 @@
+"""Velocities by which rolling shutters are compensated: where a motion shows them, and what their errors do to it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.frontend.motion.observations import RigArrays, correspond
+from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
+from graphvio.frontend.references import References
+from graphvio.frontend.tracking.measured_readouts import MeasuredReadouts
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
+from graphvio.frontend.tracking.tracker import GroupTracker
+from graphvio.frontend.tracking_frontend import TrackedFrameset
+from graphvio.geometry import se3_inverse
+from graphvio.measurements.motion import ByVelocities
+from graphvio.rig import Rig
+
+_UNKNOWN_SIGMA_M_S = 0.5
+
+
+class Readouts:
+    """Motions of body by which the rolling shutters of the newest frameset and of the references are compensated.
+
+    Args:
+        rig: with rolling shutters.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._line_s = [1e-6 * group.left.line_time_us for group in rig.groups]
+        self._measured = MeasuredReadouts(max(camera.readout_ns for camera in rig.cameras))
+        self._applied: dict[int, ReadoutMotion] = {}  # by stamp
+
+    def is_known(self, seen: TrackedFrameset) -> bool:
+        """Whether the velocity is known by which a frameset was compensated."""
+        return seen.readout is not None and seen.readout.velocity_covariance is not None
+
+    def keep(self, seen: TrackedFrameset, references: References) -> None:
+        """Remember the motion of a frameset, which may become a reference, and forget those that are none."""
+        self._applied = {ns: each for ns, each in self._applied.items() if ns in references.stamps_ns}
+        if seen.readout is not None:
+            self._applied[seen.stamp_ns] = seen.readout
+
+    def note(self, seen: TrackedFrameset, cur_T_ref: Float) -> None:
+        """Note a motion (4, 4), which shows velocities."""
+        by_imu = seen.readout if seen.readout is not None and seen.readout.is_by_imu else None
+        self._measured.note(seen.reference_stamp_ns, seen.stamp_ns, se3_inverse(cur_T_ref), by_imu)
+
+    def compensated_by_motion(
+        self, seen: TrackedFrameset, trackers: list[GroupTracker], references: References, rig: Rig
+    ) -> TrackedFrameset | None:
+        """Compensate a frameset and its reference by the velocities that motions have shown, if none are known.
+
+        Args:
+            seen: the frameset.
+            trackers: of all groups, whose newest frames change.
+            references: change, too.
+            rig: with the calibration that is in force.
+
+        Returns:
+            The frameset, or None where velocities are known, or motions do not show them.
+        """
+        of_reference = self._applied.get(seen.reference_stamp_ns)
+        if self.is_known(seen) and of_reference is not None and of_reference.velocity_covariance is not None:
+            return None
+        now, then = self._measured.at(seen.stamp_ns), self._measured.at(seen.reference_stamp_ns)
+        if now is None or then is None:
+            return None
+        frames = {j: trackers[j].read_out(now) for j in seen.frames}
+        references.read_out(seen.reference_stamp_ns, then, rig)
+        self._applied[seen.reference_stamp_ns] = then
+        reference = references.shared(frames)
+        return TrackedFrameset(seen.stamp_ns, seen.frozen, frames, reference, correspond(reference, frames), now)
+
+    def errors(
+        self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
+    ) -> ByVelocities:
+        """Return how a motion depends on the velocities.
+
+        Args:
+            seen: the frameset.
+            arrays: of the rig.
+            inlier: (N,) points that the motion is of.
+            cur_T_ref: (4, 4).
+            noise_px: of a pixel.
+        """
+        seconds, observations = self._line_seconds(seen), seen.correspondences.observations
+        derivatives = derivatives_by_velocities(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
+        readouts = seen.readout, self._applied.get(seen.reference_stamp_ns)
+        used, covariances = np.zeros((2, 3)), np.tile(_UNKNOWN_SIGMA_M_S**2 * np.eye(3), (2, 1, 1))
+        for k, readout in enumerate(readouts):
+            if readout is not None:
+                used[k] = readout.velocity
+                if readout.velocity_covariance is not None:
+                    covariances[k] = readout.velocity_covariance
+        return ByVelocities(used, derivatives, covariances)
+
+    def _line_seconds(self, seen: TrackedFrameset) -> Float:
+        """Return the times (2, N) from the stamp until each point's line was exposed, now and at the reference."""
+        parts = []
+        for j, rows in sorted(seen.correspondences.rows.items()):
+            frame, reference = seen.frames[j], seen.reference[j]
+            then = np.searchsorted(reference.ids, frame.ids[rows])
+            parts.append(self._line_s[j] * np.array([frame.pixels[rows, 1], reference.pixels[then, 1]]))
+        return np.ascontiguousarray(np.hstack(parts))
