@@ -11,15 +11,16 @@ from rendered import rendered_once
 
 from graphvio import Odometry, Rig, RigError, Trajectory, load_trajectory, open_source
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.readout_factor import readout_factor
 from graphvio.config import Config
 from graphvio.evaluation import evaluate
 from graphvio.frontend.depth.stereo import triangulate
 from graphvio.frontend.depth.tracks import TrackedFrame
-from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.imaging.frozen import Frozen
+from graphvio.frontend.motion.observations import Observations, RigArrays, correspond
 from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
 from graphvio.frontend.motion.refinement import refine
+from graphvio.frontend.readouts import Readouts
 from graphvio.frontend.tracking.measured_readouts import MeasuredReadouts
 from graphvio.frontend.tracking.rolling_shutter import (
     ReadoutMotion,
@@ -28,7 +29,9 @@ from graphvio.frontend.tracking.rolling_shutter import (
     pixels_at_stamp,
     turned_rays,
 )
+from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import ByVelocities, RelativeMotion
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.monocular.equations import visual_equations
@@ -36,7 +39,7 @@ from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.structure import Eliminated, Structure
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Camera, SingleCamera
-from graphvio.simulation import Simulator, build_scene, write_recording
+from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.simulation.named_rigs import phone, stereo
 
 DURATION_S, READOUT_US = 5.0, 20e3
@@ -126,16 +129,26 @@ def test_points_of_a_pair_are_triangulated_at_the_stamp() -> None:
     np.testing.assert_allclose(alone.points[:, :2], expected[:, :2], atol=2e-4)
 
 
-def test_readout_motion_of_a_rate_that_changes() -> None:
-    buffer = ImuBuffer(100.0)
-    for stamp_ns in range(0, 60_000_000, 5_000_000):
-        rate = MOTION.angular_velocity + 0.1 + 1e-9 * (stamp_ns - 12_000_000) * MOTION.angular_acceleration
-        buffer.add(ImuSample(stamp_ns, rate, np.array([0.0, 0.0, 9.81])))
-    interval = buffer.interval(12_000_000, 32_000_000)
-    assert interval is not None
-    found = ReadoutMotion.accelerated(interval, np.full(3, 0.1), MOTION.velocity, MOTION.acceleration)
-    np.testing.assert_allclose(found.angular_velocity, MOTION.angular_velocity, atol=1e-9)
-    np.testing.assert_allclose(found.angular_acceleration, MOTION.angular_acceleration, atol=1e-6)
+def test_readout_motion_of_rate_and_force_that_change() -> None:
+    """The IMU of a motion whose accelerations change, in a body that turns against gravity."""
+    motion, gravity = replace(MOTION, angular_jerk=np.array([90.0, -60.0, 40.0])), np.array([1.0, -2.0, -9.0])
+    gyro_bias, accel_bias, duration_s = np.full(3, 0.1), np.full(3, -0.05), 0.04
+    middles, steps_s = np.arange(0.5, 8.0) * 0.005, np.full(8, 0.005)
+    rates = motion.angular_velocity + np.outer(middles, motion.angular_acceleration)
+    rates += np.outer(0.5 * (middles**2 + 0.005**2 / 12.0), motion.angular_jerk)
+    turns = np.outer(middles, motion.angular_velocity) + np.outer(0.5 * middles**2, motion.angular_acceleration)
+    turns += np.outer(middles**3 / 6.0, motion.angular_jerk)
+    forces = np.array([so3_exp(turn).T @ (motion.acceleration - gravity) for turn in turns])
+    interval = ImuInterval(steps_s, rates + gyro_bias, forces + accel_bias)
+    found = ReadoutMotion.by_imu(interval, gyro_bias, accel_bias).falling(motion.velocity, gravity)
+    np.testing.assert_allclose(found.angular_velocity, motion.angular_velocity, atol=1e-9)
+    np.testing.assert_allclose(found.angular_acceleration, motion.angular_acceleration, atol=1e-6)
+    np.testing.assert_allclose(found.angular_jerk, motion.angular_jerk, atol=1e-4)
+    np.testing.assert_allclose(found.acceleration, motion.acceleration, atol=1e-6)
+    np.testing.assert_allclose(found.jerk, np.zeros(3), atol=1e-4)
+    one = ReadoutMotion.by_imu(ImuInterval(np.array([duration_s]), rates[:1], forces[:1]), np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(one.angular_velocity, rates[0])
+    np.testing.assert_array_equal(one.angular_acceleration, np.zeros(3))
 
 
 def test_readout_motion_goes_on_as_before() -> None:
@@ -192,8 +205,8 @@ def test_velocities_are_those_of_measured_motions() -> None:
     for known, is_newest_exact in ((by_imu, True), (None, False)):
         readouts = MeasuredReadouts(20_000_000)
         assert readouts.at(0) is None
-        readouts.note(-step_ns, 0, se3_inverse(poses[0]) @ poses[1], None)
-        readouts.note(0, step_ns, poses[2], known)
+        readouts.note(-step_ns, 0, se3_inverse(poses[0]) @ poses[1], (None, None))
+        readouts.note(0, step_ns, poses[2], (known, None))
         between, newest = readouts.at(0), readouts.at(step_ns)
         assert between is not None
         assert newest is not None
@@ -207,10 +220,20 @@ def test_velocities_are_those_of_measured_motions() -> None:
 
 def test_velocities_are_not_those_of_framesets_within_two_readouts() -> None:
     readouts = MeasuredReadouts(30_000_000)
-    readouts.note(0, 33_000_000, body_at(0.033), None)
+    readouts.note(0, 33_000_000, body_at(0.033), (None, None))
     assert readouts.at(33_000_000) is None
-    readouts.note(0, 66_000_000, body_at(0.066), None)
+    readouts.note(0, 66_000_000, body_at(0.066), (None, None))
     assert readouts.at(66_000_000) is not None
+
+
+def test_framesets_of_a_long_keyframe_are_forgotten() -> None:
+    readouts = MeasuredReadouts(20_000_000)
+    for k in range(1, 200):
+        readouts.note(0, 50_000_000 * k, np.eye(4), (MOTION, MOTION))
+    assert len(readouts._framesets) < 30
+    known = readouts.at(0)
+    assert known is not None
+    np.testing.assert_array_equal(known.angular_velocity, MOTION.angular_velocity)  # of the first one, by the gyro
 
 
 def compensated(rig: Rig, points: Float, velocity_error: Float) -> tuple[Float, Float, Float]:
@@ -255,6 +278,58 @@ def test_wrong_velocities_change_a_motion_as_its_derivatives_say(which: int) -> 
     expected = -derivatives[which] @ error  # the true velocity is less than the one that was used
     assert np.linalg.norm(measured[3:]) > 3e-4
     assert np.linalg.norm(measured - expected) < 0.1 * np.linalg.norm(measured)
+
+
+def tracked(points: Float, pixels: Float, lines: Float) -> TrackedFrame:
+    """Tracks that are seen at some lines (N,)."""
+    n = len(points)
+    whole, pixels = np.arange(n), np.column_stack([pixels[:, 0], lines])
+    none = np.zeros((n, 2))
+    return TrackedFrame(
+        0, 3 * whole, whole, pixels, points[:, :2].copy(), none, none, points, np.tile(np.eye(3), (n, 1, 1)), none,
+        np.ones(n, dtype=bool), whole,
+    )  # fmt: skip
+
+
+def test_line_times_are_of_the_points_rows_now_and_at_the_reference() -> None:
+    """Of two pairs, the second of which has lost every other track."""
+    pairs = small_rig(2)
+    rig = replace(pairs, pairs=(pairs.pairs[0], replace(pairs.pairs[1], left=rolling(pairs.pairs[1].left),
+                                                        right=rolling(pairs.pairs[1].right))))  # fmt: skip
+    random = np.random.default_rng(5)
+    points = np.column_stack([random.uniform(-0.3, 0.3, (20, 2)), np.full(20, 0.3)])
+    now, then = (random.uniform(0.0, 200.0, 20) for _ in range(2))
+    reference = {j: tracked(points, 100.0 * points[:, :2], then) for j in range(2)}
+    whole = tracked(points, 100.0 * points[:, :2], now)
+    frames = {0: whole, 1: whole.keep(np.arange(20) % 2 == 0)}
+    seen = TrackedFrameset(
+        50_000_000, Frozen(frozenset(), None, ""), frames, reference, correspond(reference, frames), None
+    )
+    seconds = Readouts(rig)._line_seconds(seen)
+    line_s = 1e-6 * rig.pairs[1].left.line_time_us
+    expected = np.zeros((2, 30))
+    expected[:, 20:] = line_s * np.array([now[::2], then[::2]])
+    np.testing.assert_allclose(seconds, expected)
+
+
+@pytest.mark.parametrize("is_single", [False, True])
+def test_compensating_again_is_compensating_once(is_single: bool) -> None:
+    rig = half_size_rig().with_cameras(rolling)
+    pair, points = rig.pairs[0], scene(rig)
+    (left_px, _), (right_px, _) = seen(pair.left, points), seen(pair.right, points)
+    left, right = pair.left.unproject(left_px)[0], pair.right.unproject(right_px)[0]
+    found, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
+    group = SingleCamera(pair.left) if is_single else pair
+    frame = replace(
+        tracked(found, left_px, left_px[:, 1]), left_rays=left, right_rays=right, right_pixels=right_px,
+        covariances=covariances, is_single=is_single,
+    )  # fmt: skip
+    once = as_at_stamp(frame, group, MOTION)
+    again = once
+    for _ in range(30):
+        again = as_at_stamp(again, group, MOTION)
+    np.testing.assert_allclose(again.points[:, 2], once.points[:, 2], rtol=1e-6)
+    np.testing.assert_allclose(again.points[:, :2], once.points[:, :2], atol=2e-3 if is_single else 1e-9)
 
 
 def by_velocities() -> ByVelocities:
@@ -307,20 +382,38 @@ def test_views_of_a_single_camera_are_from_where_its_lines_see_them() -> None:
     camera, points = rig.pairs[0].left, scene(rig)
     single = Rig((), rig.imu, singles=(SingleCamera(camera),))
     pixels, _ = seen(camera, points)
-    rays, readout = turned_rays(camera, pixels, replace(MOTION, velocity=np.zeros(3)))
+    gravity = np.array([1.0, -2.0, -9.0])
+    measured = replace(MOTION, velocity=np.zeros(3), acceleration=np.zeros(3), force=MOTION.acceleration - gravity)
+    rays, readout = turned_rays(camera, pixels, measured)
     in_cam, n = points @ camera.cam_T_body[:3, :3].T + camera.cam_T_body[:3, 3], len(points)
     landmarks = np.column_stack([in_cam[:, :2] / in_cam[:, 2:], 1.0 / in_cam[:, 2]])
     zero = np.zeros(n, dtype=np.int64)
     structure = Structure(np.tile(camera.body_T_cam, (n, 1, 1)), np.arange(n + 1), zero, zero, rays, readout)
     errors2 = [
         visual_equations(
-            np.eye(4)[None], velocity[None], Cameras.of(single), landmarks, structure, 0.3, 0.0, 1e4,
+            np.eye(4)[None],
+            np.array([[velocity, 0.5 * gravity]]),
+            Cameras.of(single),
+            landmarks,
+            structure,
+            0.3,
+            0.0,
+            1e4,
             Eliminated.empty(structure),
         )[3]
         for velocity in (MOTION.velocity, np.zeros(3))
-    ]  # fmt: skip
+    ]
     assert errors2[0].max() < 1e-6
     assert np.median(errors2[1]) > 1.0
+
+
+@pytest.fixture(scope="module")
+def two_pairs() -> Path:
+    def write(folder: Path) -> None:
+        rig = default_rig().with_cameras(half_size).with_cameras(rolling)
+        write_recording(Simulator(build_scene("room", 3.5), rig, 1, rate_hz=10.0), folder)
+
+    return rendered_once("room-rolling-two-pairs", write, "320x240", 3.5)
 
 
 @pytest.fixture(scope="module")
@@ -358,6 +451,32 @@ def test_a_walk_that_begins_in_motion_is_as_accurate_as_one_from_a_standstill(wa
     rig = open_source(walk).rig
     assert ate_m(walk, rig, 2.0) < 0.0008
     assert ate_m(walk, rig.without_imu(), 2.0) < 0.002
+
+
+def test_images_that_are_read_out_until_the_next_ones_are_as_accurate() -> None:
+    """30 Hz and 30 ms, from motion on: without velocities as variables, IMU and vision contradict each other."""
+
+    def write(folder: Path) -> None:
+        line_us = 30e3 / 240
+        rig = stereo().with_cameras(half_size).with_cameras(lambda camera: replace(camera, line_time_us=line_us))
+        write_recording(Simulator(build_scene("room", 4.0), rig, 1, rate_hz=30.0), folder)
+
+    walk = rendered_once("room-rolling-30hz", write, "320x240", 4.0)
+    assert ate_m(walk, open_source(walk).rig, 1.5) < 0.0015
+
+
+@pytest.mark.parametrize("has_imu", [True, False])
+def test_several_pairs_with_rolling_shutters_go_on_over_keyframes(has_imu: bool, two_pairs: Path) -> None:
+    rig = open_source(two_pairs).rig
+    assert ate_m(two_pairs, rig if has_imu else rig.without_imu(), 1.0) < (0.002 if has_imu else 0.01)
+
+
+@pytest.mark.parametrize("has_imu", [True, False])
+def test_a_pair_with_rolling_shutters_beside_a_single_camera_goes_on(has_imu: bool, two_pairs: Path) -> None:
+    rig = open_source(two_pairs).rig.with_only(["cam0", "cam1", "cam2"])
+    mixed = replace(rig, singles=(SingleCamera(replace(rig.singles[0].left, line_time_us=0.0)),))
+    for each in (rig, mixed):
+        assert ate_m(two_pairs, each if has_imu else each.without_imu(), 1.0) < 0.03
 
 
 def test_a_single_camera_is_as_accurate_with_a_rolling_shutter() -> None:

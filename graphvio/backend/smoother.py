@@ -203,25 +203,24 @@ class Smoother:
         if motion.by_velocities is None:
             of_state = relative_covariance(predicted, self._window.joint_covariance([reference, newest]))
         else:
-            measured, of_state = self._with_velocities(motion, motion.by_velocities, predicted)
+            measured, of_state = self._with_velocities(motion, motion.by_velocities, reference, predicted)
         return gate_motion(measured, covariance, predicted, sigma_scale**2 * of_state, self._config.gate_probability)
 
     def _with_velocities(
-        self, motion: RelativeMotion, by_velocities: ByVelocities, predicted: Float
+        self, motion: RelativeMotion, by_velocities: ByVelocities, reference: int, predicted: Float
     ) -> tuple[Float, Float]:
-        """Return a motion by the window's velocities (4, 4), and the covariance (6, 6) of what the window predicts."""
+        """Return a motion by the window's velocities (4, 4), and the covariance (6, 6) of what the window predicts.
+
+        The predicted motion (4, 4) is from the pose with the key ``reference``.
+        """
+        self._has_rolling_shutter = True
         states = [self.state(motion.stamp_ns), self.state(motion.reference_stamp_ns)]
         nav_R_body = np.array([state.nav_T_body[:3, :3] for state in states])
         in_body = np.array([state.nav_T_body[:3, :3].T @ state.velocity_nav for state in states])
-        reference, _ = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
-        joint = self._window.joint_covariance([reference, *self._keys_of_readout(motion)])
+        newest, first = self._index_of[motion.stamp_ns], self._index_of[motion.reference_stamp_ns]
+        joint = self._window.joint_covariance([reference, x(newest), v(newest), v(first)])
         jacobian = np.hstack(jacobians_of(predicted, by_velocities, nav_R_body, in_body))
         return corrected(motion, by_velocities, in_body), jacobian @ joint @ jacobian.T
-
-    def _keys_of_readout(self, motion: RelativeMotion) -> tuple[int, int, int]:
-        """Return the keys of the newest pose, and of the velocities that a motion by rolling shutters depends on."""
-        newest, reference = self._index_of[motion.stamp_ns], self._index_of[motion.reference_stamp_ns]
-        return x(newest), v(newest), v(reference)
 
     def gate_zero_velocity(self) -> GateResult:
         """Test the innovation of a velocity of zero."""
@@ -281,13 +280,12 @@ class Smoother:
         self._views.add(k, motion, self._window)
         reference, covariance = self._views.seen(k, motion)
         noise = robust(gaussian(covariance), self._config.huber_probability)
-        newest, *velocities = self._keys_of_readout(motion)
+        newest = self._index_of[motion.stamp_ns]
         if motion.by_velocities is None:
             measured = gtsam.Pose3(motion.reference_T_current)
-            self._window.add(gtsam.BetweenFactorPose3(reference, newest, measured, noise))
+            self._window.add(gtsam.BetweenFactorPose3(reference, x(newest), measured, noise))
         else:
-            self._has_rolling_shutter = True
-            self._window.add(readout_factor(reference, newest, (velocities[0], velocities[1]), motion, noise))
+            self._window.add(readout_factor(reference, x(newest), (v(newest), v(k)), motion, noise))
 
     def update(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
         """Update the newest states by the newest factors.

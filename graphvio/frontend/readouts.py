@@ -43,7 +43,8 @@ class Readouts:
 
     def note(self, seen: TrackedFrameset, cur_T_ref: Float) -> None:
         """Note a motion (4, 4), which shows velocities."""
-        by_imu = seen.readout if seen.readout is not None and seen.readout.is_by_imu else None
+        now, then = seen.readout, self._applied.get(seen.reference_stamp_ns)
+        by_imu = _by_imu(now), _by_imu(then)
         self._measured.note(seen.reference_stamp_ns, seen.stamp_ns, se3_inverse(cur_T_ref), by_imu)
 
     def compensated_by_motion(
@@ -103,3 +104,7 @@ class Readouts:
             then = np.searchsorted(reference.ids, frame.ids[rows])
             parts.append(self._line_s[j] * np.array([frame.pixels[rows, 1], reference.pixels[then, 1]]))
         return np.ascontiguousarray(np.hstack(parts))
+
+
+def _by_imu(readout: ReadoutMotion | None) -> ReadoutMotion | None:
+    return readout if readout is not None and readout.is_by_imu else None

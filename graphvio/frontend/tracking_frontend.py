@@ -45,7 +45,7 @@ class TrackedFrameset(NamedTuple):
         frames: Pair index -> its tracks.
         reference: Pair index -> its tracks at the reference; empty if there is none.
         correspondences: Points of both.
-        readout: Motion of body while rolling shutters read the images out, or None without these or if unknown.
+        readout: Motion of body by which rolling shutters are compensated, or None without these or if it is unknown.
     """
 
     stamp_ns: int

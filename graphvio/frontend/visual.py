@@ -102,6 +102,7 @@ class VisualFrontend(TrackingFrontend):
                 seen, agreement, reason = self._with_shown_velocities(seen, self._readouts, agreement, motion_since)
             self._readouts.keep(seen, self._references)
             self.are_velocities_known = self._readouts.is_known(seen)
+        self._note_contradiction(seen.stamp_ns, agreement)
         few = self._fit_few_points(seen, motion_since) if agreement is None else None
         judged = self._judge(seen, agreement, reason, motion_since)
         if agreement is not None and judged.quality is Quality.GOOD:
@@ -137,8 +138,6 @@ class VisualFrontend(TrackingFrontend):
             refined, observations = joint_motion(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
             agreement = agree(arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt)
-            if agreement.contradicts:
-                self._contradicted_ns = seen.stamp_ns
         else:
             refined = best_pair_motion(arrays, observations, start, config, rng)
             agreement = Agreement((MotionHypothesis(observations.pairs, refined),), {})
@@ -282,6 +281,11 @@ class VisualFrontend(TrackingFrontend):
         for j in seen.frames:
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
 
+    def _note_contradiction(self, now_ns: int, agreement: Agreement | None) -> None:
+        """Note whether the pairs contradict each other."""
+        if agreement is not None and agreement.contradicts:
+            self._contradicted_ns = now_ns
+
     def _is_in_doubt(self, now_ns: int) -> bool:
         """Whether the pairs contradicted each other a moment ago."""
         return self._contradicted_ns is not None and 0 <= now_ns - self._contradicted_ns < THRESHOLDS.agreement.doubt_ns
@@ -291,7 +295,7 @@ class VisualFrontend(TrackingFrontend):
         stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
         return [
             checked_hypothesis(
-                self._with_depth_errors(self._relative_motion(seen, hypothesis.refined), seen, hypothesis.refined),
+                self._with_nuisances(self._relative_motion(seen, hypothesis.refined), seen, hypothesis.refined),
                 seen.frozen.all_since_ns,
                 stereo,
                 (hypothesis.refined.rms_px() or 0.0) / self._config.motion.pixel_sigma_px,
@@ -303,7 +307,7 @@ class VisualFrontend(TrackingFrontend):
         ref_T_cur = se3_inverse(refined.cur_T_ref)
         scaled = self._scale_covariance(ref_T_cur)
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
-        motion = RelativeMotion(
+        return RelativeMotion(
             seen.reference_stamp_ns,
             seen.stamp_ns,
             ref_T_cur,
@@ -311,7 +315,6 @@ class VisualFrontend(TrackingFrontend):
             np.zeros((6, 6)) if used_once else refined.shared_covariance,
             int(refined.inlier.sum()),
         )
-        return self._with_readout_errors(motion, seen, refined)
 
     def _with_readout_errors(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
@@ -340,7 +343,13 @@ class VisualFrontend(TrackingFrontend):
             int(few.inlier.sum()),
             pairs=seen.correspondences.observations.of_rows(few.inlier).pairs,
         )
-        return self._with_depth_errors(self._with_readout_errors(motion, seen, few), seen, few)
+        return self._with_nuisances(motion, seen, few)
+
+    def _with_nuisances(
+        self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
+    ) -> RelativeMotion:
+        """Add how a motion depends on the velocities of readouts and on the pairs' depths, which may be wrong."""
+        return self._with_depth_errors(self._with_readout_errors(motion, seen, refined), seen, refined)
 
     def _with_depth_errors(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints

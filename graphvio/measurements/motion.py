@@ -58,7 +58,7 @@ class ByVelocities(NamedTuple):
 
     Attributes:
         used: (2, 3) m/s, of body at the later instant and at the earlier one, in body there.
-        derivatives: (2, 6, 3) of the motion with respect to the true velocities, tangent
+        derivatives: (2, 6, 3) of the motion as it is measured with these, with respect to the true velocities, tangent
             ``[rotation, translation]`` in the body frame of the later instant.
         covariances: (2, 3, 3) of the velocities that were used.
     """
@@ -84,7 +84,8 @@ class RelativeMotion:
             Zero for pairs that did not measure it, None where errors of pairs are not estimated.
         calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
             where they add nothing. Innovation tests allow for it.
-        by_velocities: Of rolling shutters, for those who estimate the velocities; others use `with_any_velocity`.
+        by_velocities: Of rolling shutters, for those who estimate the velocities. The covariance does not allow for
+            errors of these; that of `with_any_velocity` does.
         pairs: Indices of the pairs and single cameras whose motion it is, of one of several hypotheses and of a partial
             motion.
     """
@@ -163,8 +164,8 @@ class CameraTracks(NamedTuple):
         matches: the same tracks in other cameras whose views overlap.
         handed_over: which of them follow points of other cameras' tracks.
         readout: (N, 4) of a rolling shutter, when and from where a line sees: ``[seconds, x, y, z]`` from the stamp to
-            the line's exposure, and the camera's way until then in metres, frame body at the stamp, but for what
-            body's velocity at the stamp adds. (0, 4) of a global shutter.
+            the line's exposure, and the camera's way until then in metres, frame body at the stamp, by turn and
+            specific force: without what velocity and gravity add. (0, 4) of a global shutter.
     """
 
     ids: Int

@@ -95,7 +95,7 @@ def equations(
     n_camera_parameters = states.n_camera_parameters
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, cost, errors2 = visual_equations(
-        states.poses, states.velocities, states.cameras(measured.cameras), landmarks, measured.structure,
+        states.poses, states.falls, states.cameras(measured.cameras), landmarks, measured.structure,
         measured.sigma_px, measured.depth_information, ROBUST_SCALE, eliminated,
     )  # fmt: skip
     inertial = inertial_equations(
@@ -156,7 +156,7 @@ def adjust(
     """
     cameras, n = states.cameras(measured.cameras), len(states.poses)
     landmarks = located(
-        states.poses, states.velocities, cameras, landmarks, measured.structure, measured.sigma_px,
+        states.poses, states.falls, cameras, landmarks, measured.structure, measured.sigma_px,
         measured.depth_information, False,
     )  # fmt: skip
     at = equations(measured, states, landmarks, prior, file)
@@ -221,12 +221,10 @@ def views_only(
     Returns:
         Information (6 K, 6 K) and gradient (6 K,).
     """
-    landmarks = located(
-        states.poses, states.velocities, cameras, landmarks, structure, sigma_px, PRIOR_INFORMATION, True
-    )
+    landmarks = located(states.poses, states.falls, cameras, landmarks, structure, sigma_px, PRIOR_INFORMATION, True)
     information, gradient, _, _ = visual_equations(
         states.poses,
-        states.velocities,
+        states.falls,
         cameras,
         landmarks,
         structure,

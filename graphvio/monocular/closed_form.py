@@ -218,9 +218,7 @@ def _equations(chain: _Chain, views: _Views) -> _Equations:
     delays, times = views.delays, chain.times[k] + views.delays
     places = chain.positions[k] + delays[:, None] * chain.velocities[k]
     places += np.einsum("nij,nj->ni", chain.rotations[k], views.levers)
-    # A line moves on at the stamp's velocity; its acceleration is in the lever.
-    times2 = times**2 - delays**2
-    dt, dt2 = times[first] - times, 0.5 * (times2[first] - times2)
+    dt, dt2 = times[first] - times, 0.5 * (times[first] ** 2 - times**2)
     across = weights * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
     metre = np.einsum("nij,nj->ni", across, places[first] - places)[:, :, None]
     by_motion = np.concatenate([across * dt[:, None, None], across * dt2[:, None, None], metre], axis=2)

@@ -69,14 +69,14 @@ def _new_sums(n_poses: int, n_cameras: int, n_calibration: int) -> _Sums:
 
 @vector_kernel
 def visual_equations(
-    poses: Float, velocities: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
+    poses: Float, falls: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
     depth_information: float, scale: float, eliminated: Eliminated,
 ) -> tuple[Float, Float, float, Float]:  # fmt: skip
     """Linearise the reprojection errors, with the landmarks eliminated.
 
     Args:
         poses: (K, 4, 4) ``odom_T_body``; perturbed on the right, ``R Exp(r)``, ``p + R t``.
-        velocities: (K, 3) m/s, frame odom, by which rolling shutters move on.
+        falls: (K, 2, 3) by which rolling shutters move on, see `graphvio.monocular.states.States`.
         cameras: that see the landmarks.
         landmarks: (L, 3).
         structure: of these.
@@ -110,7 +110,7 @@ def visual_equations(
         for n in range(first, last):
             k, j = structure.state[n], structure.camera[n]
             in_front = is_possible and whiten_view(
-                poses[k], velocities[k], cameras, j, structure.odom_T_landmark[point], landmarks[point],
+                poses[k], falls[k], cameras, j, structure.odom_T_landmark[point], landmarks[point],
                 structure.rays[n], structure.readout[n], sigma_px, True, by_lens, rows,
             )  # fmt: skip
             u, v = rows[0], rows[1]

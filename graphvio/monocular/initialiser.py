@@ -162,7 +162,7 @@ class Initialiser:
                 self._fits_no_motion = True
                 return None
             places = located(
-                states.poses, states.velocities, cameras, places, structure, self._sigma_px, PRIOR_INFORMATION, True
+                states.poses, states.falls, cameras, places, structure, self._sigma_px, PRIOR_INFORMATION, True
             )
             measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
             if file is not None and is_first:

@@ -101,7 +101,7 @@ def _linearised(
     n, n_camera_parameters = len(states.poses), states.n_camera_parameters
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, _, _ = visual_equations(
-        states.poses, states.velocities, states.cameras(measured.cameras), landmarks, measured.structure,
+        states.poses, states.falls, states.cameras(measured.cameras), landmarks, measured.structure,
         measured.sigma_px, measured.depth_information, ROBUST_SCALE, eliminated,
     )  # fmt: skip
     size = 9 * n + GRAVITY + BIASES + len(states.calibration)

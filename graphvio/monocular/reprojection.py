@@ -106,17 +106,17 @@ def _by_lens(cameras: Cameras, j: int, x: float, y: float, out: Float) -> None:
 
 @kernel
 def whiten_view(
-    pose: Float, velocity: Float, cameras: Cameras, j: int, frame: Float, landmark: Float, ray: Float, readout: Float,
+    pose: Float, fall: Float, cameras: Cameras, j: int, frame: Float, landmark: Float, ray: Float, readout: Float,
     sigma_px: float, of_state: bool, by_lens: Float, rows: Float,
 ) -> bool:  # fmt: skip
     """Fill the rows (2, COLUMNS) of one view: derivatives with respect to pose, camera and landmark, whitened error.
 
-    Coordinates are variables throughout: arrays would be allocated for each view. What the velocity of a rolling
-    shutter adds has no derivatives: over 10 ms, an error of 5 cm/s is half a millimetre.
+    Coordinates are variables throughout: arrays would be allocated for each view. Where a rolling shutter's line is
+    exposed, the way of the camera since the stamp has no derivatives: over 10 ms, 5 cm/s are half a millimetre.
 
     Args:
         pose: (4, 4) ``odom_T_body``.
-        velocity: (3,) m/s of body, frame odom.
+        fall: (2, 3) see `graphvio.monocular.states.States.falls`.
         cameras: of the rig.
         j: index of the camera.
         frame: (4, 4) of the landmark in odom.
@@ -145,9 +145,9 @@ def whiten_view(
     centre_x, centre_y, centre_z = body_T_cam[0, 3], body_T_cam[1, 3], body_T_cam[2, 3]
     t = readout[0]
     if t != 0.0:
-        centre_x += readout[1] + t * (pose[0, 0] * velocity[0] + pose[1, 0] * velocity[1] + pose[2, 0] * velocity[2])
-        centre_y += readout[2] + t * (pose[0, 1] * velocity[0] + pose[1, 1] * velocity[1] + pose[2, 1] * velocity[2])
-        centre_z += readout[3] + t * (pose[0, 2] * velocity[0] + pose[1, 2] * velocity[1] + pose[2, 2] * velocity[2])
+        centre_x += readout[1] + t * (fall[0, 0] + t * fall[1, 0])
+        centre_y += readout[2] + t * (fall[0, 1] + t * fall[1, 1])
+        centre_z += readout[3] + t * (fall[0, 2] + t * fall[1, 2])
     left_x, left_y, left_z = body_x - w * centre_x, body_y - w * centre_y, body_z - w * centre_z
     cam_x = body_T_cam[0, 0] * left_x + body_T_cam[1, 0] * left_y + body_T_cam[2, 0] * left_z
     cam_y = body_T_cam[0, 1] * left_x + body_T_cam[1, 1] * left_y + body_T_cam[2, 1] * left_z

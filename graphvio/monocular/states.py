@@ -57,6 +57,12 @@ class States:
         """Return the cameras, from those of the rig file."""
         return of_file.moved(self.calibration[: self.n_camera_parameters]) if self.calibration.any() else of_file
 
+    @property
+    def falls(self) -> Float:
+        """(K, 2, 3) way of body after t seconds without any force, in body: the coefficients of t and of its square."""
+        falls = np.stack([self.velocities, np.broadcast_to(0.5 * self.gravity, self.velocities.shape)], axis=1)
+        return np.ascontiguousarray(falls @ self.poses[:, :3, :3])
+
     def of(self, kept: Int) -> States:
         """Return some of the states, by their indices."""
         return replace(self, stamps_ns=self.stamps_ns[kept], poses=self.poses[kept], velocities=self.velocities[kept])

@@ -120,7 +120,7 @@ def landmarks_after(
 
 @kernel
 def located(
-    poses: Float, velocities: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
+    poses: Float, falls: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
     depth_information: float, everywhere: bool,
 ) -> Float:  # fmt: skip
     """Return the landmarks (L, 3) with those of few views, or all, located again for poses that stay."""
@@ -139,7 +139,7 @@ def located(
             for n in range(first, last):
                 k, j = structure.state[n], structure.camera[n]
                 if not whiten_view(
-                    poses[k], velocities[k], cameras, j, structure.odom_T_landmark[point], moved[point],
+                    poses[k], falls[k], cameras, j, structure.odom_T_landmark[point], moved[point],
                     structure.rays[n], structure.readout[n], sigma_px, False, by_lens, rows,
                 ):  # fmt: skip
                     continue

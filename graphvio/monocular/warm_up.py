@@ -41,9 +41,7 @@ def warm_up_keyframe_window(rig: Rig) -> None:
         np.zeros((2, 2)),
         np.zeros((2, 4)),
     )
-    places = located(
-        states.poses, states.velocities, cameras, np.zeros((1, 3)), structure, 1.0, PRIOR_INFORMATION, True
-    )
+    places = located(states.poses, states.falls, cameras, np.zeros((1, 3)), structure, 1.0, PRIOR_INFORMATION, True)
     measured = Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64))
     adjust(measured, states, places, prior, max_steps=1, converged=0.0)
     cameras.moved(np.zeros(SINGLE * len(rig.singles)))

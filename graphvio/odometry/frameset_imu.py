@@ -59,6 +59,7 @@ class FramesetImu:
             self._clock_watch = ClockWatch(rig, self._clock, synchroniser)
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._first_ns: int | None = None
+        self._initialisations = 0
 
     @property
     def is_left_out(self) -> bool:
@@ -167,13 +168,16 @@ class FramesetImu:
         if interval is None:
             return None
         if not self._estimator.has_pose:
-            return ReadoutMotion.accelerated(interval, np.zeros(3), np.zeros(3), np.zeros(3))  # only how it turns
+            return ReadoutMotion.by_imu(interval, np.zeros(3), np.zeros(3))
         state = self._estimator.state()
         body_R_nav = state.nav_T_body[:3, :3].T
-        acceleration = interval.mean_force - state.accel_bias + body_R_nav @ state.gravity_nav
-        readout = ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
-        covariance = self._estimator.covariance.velocity
-        if covariance is None or np.linalg.eigvalsh(covariance)[-1] > _MAX_VELOCITY_SIGMA_M_S**2:
+        readout = ReadoutMotion.by_imu(interval, state.gyro_bias, state.accel_bias)
+        readout = readout.falling(body_R_nav @ state.velocity_nav, body_R_nav @ state.gravity_nav)
+        covariance, initialisations = self._estimator.covariance.velocity, self._initialisations
+        self._initialisations = self._estimator.initialisations  # since the last frameset, of which the covariance is
+        if covariance is None or initialisations != self._initialisations:
+            return readout
+        if np.linalg.eigvalsh(covariance)[-1] > _MAX_VELOCITY_SIGMA_M_S**2:
             return readout
         return replace(readout, velocity_covariance=body_R_nav @ covariance @ body_R_nav.T)
 

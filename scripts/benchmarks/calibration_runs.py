@@ -71,6 +71,7 @@ class WronglyCalibrated:
         rig_change: with which it was rendered, one of `graphvio.simulation.RIG_CHANGES`, or None.
         error: sizes of the errors.
         seed: by which they are sampled.
+        begin_s: where the odometry begins in it: in motion, after the scene's first second.
     """
 
     def __init__(
@@ -81,8 +82,9 @@ class WronglyCalibrated:
         rig_change: str | None,
         error: CalibrationErrorSizes,
         seed: int,
+        begin_s: float = 0.0,
     ) -> None:
-        self._folder, self._duration_s = folder, duration_s
+        self._folder, self._duration_s, self._begin_s = folder, duration_s, begin_s
         exact = open_source(folder)
         if exact.truth is None:
             raise GraphvioError(f"{folder}: holds no true trajectory; remove it, so that it is rendered again")
@@ -95,11 +97,13 @@ class WronglyCalibrated:
         )
         self._true_rig = simulator.rig_at(-1)
         track = simulator.imu_track
+        begin_ns = track.stamps_ns[0] + round(1e9 * begin_s)
         self._samples = [
             ImuSample(int(stamp), rate, force)
             for stamp, rate, force in zip(
                 track.stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True
             )
+            if stamp >= begin_ns
         ]
 
     def run(self, config: Config, select: Callable[[Rig], Rig]) -> CalibrationOutcome:
@@ -140,7 +144,7 @@ class WronglyCalibrated:
 
     def _measurements(self, rig: Rig) -> Iterator[Measurement]:
         """Merge the images on disk with the samples in memory."""
-        source = open_source(self._folder, rig, to_s=self._duration_s)
+        source = open_source(self._folder, rig, from_s=self._begin_s, to_s=self._duration_s)
         framesets = (measurement for measurement in source if isinstance(measurement, FrameSet))
         if rig.imu is None:
             return framesets

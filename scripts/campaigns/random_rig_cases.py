@@ -15,6 +15,7 @@ from graphvio.simulation.default_rig import rotation_zyx
 SCENES = ("room", "corridor", "stairs", "calibration")
 _SIZES_PX = ((320, 240), (512, 512), (640, 400), (640, 480), (752, 480))
 _RATES_HZ = (8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0)
+_MAX_READOUT_US = 33e3
 _IMU_RATES_HZ = (100.0, 200.0, 400.0)
 _LENSES = {
     "radial-tangential": ([-0.28, 0.07, 2e-4, 2e-5], 100.0),
@@ -37,21 +38,27 @@ class RandomRig:
         scene: of the simulator.
         rate_hz: framesets per second.
         trigger_offset_ms: of each pair after the one before; 0 where all are triggered together.
+        begin_s: instant of the walk at which the odometry begins: at 0 s it stands still.
     """
 
     rig: Rig
     scene: str
     rate_hz: float
     trigger_offset_ms: float
+    begin_s: float
 
     @property
     def summary(self) -> str:
         """A line about it."""
         pairs = [f"{pair.left.model} {100 * pair.baseline_m:.0f} cm" for pair in self.rig.pairs]
         singles = [f"{single.left.model} single" for single in self.rig.singles]
+        begin = f" from {self.begin_s:.1f} s" if self.begin_s else ""
         offset = f", {self.trigger_offset_ms:.0f} ms apart" if self.trigger_offset_ms else ""
-        width, height = self.rig.cameras[0].size_px
-        return f"{self.scene}, {self.rate_hz:g} Hz{offset}, {width}x{height}: {'; '.join([*pairs, *singles])}"
+        camera = self.rig.cameras[0]
+        readout = f", readout {1e-6 * camera.readout_ns:.0f} ms" if camera.readout_ns else ""
+        size = "{}x{}".format(*camera.size_px)
+        how = f"{self.scene}{begin}, {self.rate_hz:g} Hz{offset}{readout}, {size}"
+        return f"{how}: {'; '.join([*pairs, *singles])}"
 
 
 def sample_rig(seed: int) -> RandomRig:
@@ -85,12 +92,14 @@ def sample_rig(seed: int) -> RandomRig:
     )
     rate_hz = float(random.choice(_RATES_HZ))
     is_apart = pair_count > 1 and random.random() < 0.3
-    return RandomRig(
-        Rig(tuple(pairs), imu, name=f"random-{seed}", singles=tuple(singles)),
-        SCENES[random.integers(len(SCENES))],
-        rate_hz,
-        float(random.uniform(5.0, 500.0 / rate_hz)) if is_apart else 0.0,
-    )
+    scene = SCENES[random.integers(len(SCENES))]
+    trigger_offset_ms = float(random.uniform(5.0, 500.0 / rate_hz)) if is_apart else 0.0
+    rig = Rig(tuple(pairs), imu, name=f"random-{seed}", singles=tuple(singles))
+    if random.random() < 0.3:
+        readout_us = random.uniform(0.2, 0.95) * min(1e6 / rate_hz, _MAX_READOUT_US)
+        rig = rig.with_cameras(lambda camera: replace(camera, line_time_us=readout_us / camera.size_px[1]))
+    begin_s = float(random.uniform(1.5, 5.0)) if random.random() < 0.5 else 0.0
+    return RandomRig(rig, scene, rate_hz, trigger_offset_ms, begin_s)
 
 
 def _place(random: np.random.Generator) -> Float:

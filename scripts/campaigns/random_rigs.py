@@ -1,9 +1,10 @@
 """``scripts/campaign random-rigs``: rigs that nobody chose, with exact and with wrong calibration files.
 
 Each rig is sampled: none to three pairs, none to four single cameras, any lens model, field of view, place and
-direction; baselines of 3 to 25 cm, 8 to 40 Hz, pairs triggered together or apart, IMUs with up to eight times the usual
-noise. It walks through one of the simulator's scenes, by its exact calibration and by one that is wrong at level 1, 2
-or 3 in turn, and all its poses count, those before the calibration is known too.
+direction; baselines of 3 to 25 cm, 8 to 40 Hz, pairs triggered together or apart, global or rolling shutters, IMUs with
+up to eight times the usual noise. It walks through one of the simulator's scenes, from a standstill or from the middle
+of its motion on, by its exact calibration and by one that is wrong at level 1, 2 or 3 in turn, and all its poses count,
+those before the calibration is known too.
 """
 
 from __future__ import annotations
@@ -125,11 +126,13 @@ def _run(args: argparse.Namespace, seed: int) -> list[_Result]:
     folder = rendered_once(args.data, sampled.scene, variant, render, sampler)
     truth = open_source(folder).truth
     assert truth is not None
-    positions, results = load_trajectory(truth).nav_T_body[:, :3, 3], []
+    walked = load_trajectory(truth)
+    since_ns = walked.stamps_ns[0] + round(1e9 * sampled.begin_s)
+    positions, results = walked.nav_T_body[walked.stamps_ns >= since_ns, :3, 3], []
     path_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     for level in (EXACT, LEVELS[seed % len(LEVELS)]):
         error = CalibrationErrorSizes() if level == EXACT else CalibrationErrorSizes.of_level(level)
-        walk = WronglyCalibrated(folder, sampled.scene, args.duration, None, error, seed)
+        walk = WronglyCalibrated(folder, sampled.scene, args.duration, None, error, seed, sampled.begin_s)
         results.append(_Result(seed, sampled, level, path_m, walk.run(Config.load("default"), lambda rig: rig)))
     return results
 

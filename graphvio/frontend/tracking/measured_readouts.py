@@ -39,21 +39,29 @@ class MeasuredReadouts:
         self._shortest_ns = round(_MIN_READOUTS_BETWEEN * readout_ns)
         self._framesets: dict[int, _Frameset] = {}  # in time order
 
-    def note(self, reference_ns: int, stamp_ns: int, reference_T_body: Float, by_imu: ReadoutMotion | None) -> None:
+    def note(
+        self,
+        reference_ns: int,
+        stamp_ns: int,
+        reference_T_body: Float,
+        by_imu: tuple[ReadoutMotion | None, ReadoutMotion | None],
+    ) -> None:
         """Note a motion, or that it is measured again.
 
         Args:
             reference_ns: stamp of the frameset that it is measured from.
             stamp_ns: stamp of the newest frameset.
             reference_T_body: (4, 4) pose of body at the newest frameset.
-            by_imu: turn and acceleration at the newest frameset by an IMU, or None.
+            by_imu: turn and acceleration by an IMU at the newest frameset and at the reference, or None.
         """
         if reference_ns not in self._framesets:
-            self._framesets = {reference_ns: _Frameset(np.eye(4), None)}
+            self._framesets = {reference_ns: _Frameset(np.eye(4), by_imu[1])}
         origin_T_body = self._framesets[reference_ns].origin_T_body @ reference_T_body
-        self._framesets[stamp_ns] = _Frameset(origin_T_body, by_imu)
-        oldest_ns = min(reference_ns, stamp_ns) - self._shortest_ns - _LONGEST_NS
-        self._framesets = {ns: each for ns, each in self._framesets.items() if ns >= oldest_ns}
+        self._framesets[stamp_ns] = _Frameset(origin_T_body, by_imu[0])
+        near_ns = self._shortest_ns + _LONGEST_NS
+        self._framesets = {
+            ns: each for ns, each in self._framesets.items() if min(stamp_ns - ns, abs(reference_ns - ns)) <= near_ns
+        }
 
     def at(self, stamp_ns: int) -> ReadoutMotion | None:
         """Return the motion at a frameset, by one before and one after it, or by one of them; None if there is none.
@@ -71,7 +79,11 @@ class MeasuredReadouts:
             rates[: len(others)] = np.linalg.solve(seconds[:, None] ** np.arange(1, len(others) + 1), ways)
             sigma = _SIGMA_M_S if len(others) > 1 else 0.5 * _ACCELERATION_SIGMA * abs(seconds[0])
             return ReadoutMotion(
-                rates[0, :3], rates[0, 3:], 2.0 * rates[1, :3], 2.0 * rates[1, 3:], sigma**2 * np.eye(3)
+                rates[0, :3],
+                rates[0, 3:],
+                2.0 * rates[1, :3],
+                2.0 * rates[1, 3:],
+                velocity_covariance=sigma**2 * np.eye(3),
             )
         accelerations = np.array([self._acceleration(ns, stamp_ns) for ns in others])
         gained = seconds[:, None] * (here.by_imu.acceleration / 3.0 + accelerations / 6.0)

@@ -1,7 +1,7 @@
 """Compensation of rolling shutters: where points of an image were seen at its stamp, and where a line sees them.
 
 Lines are exposed one after the other, the first at the image's stamp. Within the readout the rig is taken to turn and
-to move at constant accelerations; a point's depth says how its pixel moves with that.
+to move at accelerations that change linearly; a point's depth says how its pixel moves with that.
 """
 
 from __future__ import annotations
@@ -20,17 +20,21 @@ from graphvio.rig import Camera, CameraGroup, SingleCamera
 
 _ROUNDS = 3  # a point's line depends on its pixel, and its pixel on the line
 _MIN_Z = 1e-3
+_MAX_POWER_OF_RATE = 2  # of time; at the end of a turn, the rate of 40 ms is no linear function
 
 
 @dataclass(frozen=True, eq=False)
 class ReadoutMotion:
-    """How body moves while an image is read out.
+    """How body moves while an image is read out: turn and way are polynomials of the time since the stamp.
 
     Attributes:
         angular_velocity: (3,) rad/s at the image's stamp, frame body.
         velocity: (3,) m/s at the image's stamp, frame body at that instant.
-        angular_acceleration: (3,) rad/s^2, frame body.
-        acceleration: (3,) m/s^2, frame body at the stamp.
+        angular_acceleration: (3,) rad/s^2 at the stamp, frame body.
+        acceleration: (3,) m/s^2 at the stamp, frame body at the stamp.
+        angular_jerk: (3,) rad/s^3, frame body.
+        jerk: (3,) m/s^3, frame body at the stamp.
+        force: (3,) m/s^2 specific force at the stamp, the acceleration without gravity, which may not be known.
         velocity_covariance: (3, 3) of the velocity, (m/s)^2, or None where it is but a guess.
         is_by_imu: Whether an IMU has measured turn and acceleration.
     """
@@ -39,18 +43,26 @@ class ReadoutMotion:
     velocity: Float
     angular_acceleration: Float = field(default_factory=lambda: np.zeros(3))
     acceleration: Float = field(default_factory=lambda: np.zeros(3))
+    angular_jerk: Float = field(default_factory=lambda: np.zeros(3))
+    jerk: Float = field(default_factory=lambda: np.zeros(3))
+    force: Float = field(default_factory=lambda: np.zeros(3))
     velocity_covariance: Float | None = None
     is_by_imu: bool = False
 
     @staticmethod
-    def accelerated(interval: ImuInterval, gyro_bias: Float, velocity: Float, acceleration: Float) -> ReadoutMotion:
-        """Return the motion that a gyro measures during the readout; its rate is taken to change linearly."""
-        steps_s, rates = interval.steps_s, interval.angular_velocity - gyro_bias
-        seconds = float(steps_s.sum())
-        between_s = seconds - 0.5 * (steps_s[0] + steps_s[-1])  # from the middle of the first step to that of the last
-        angular_acceleration = (rates[-1] - rates[0]) / between_s if between_s > 0.5 * seconds else np.zeros(3)
-        first_rate = steps_s @ rates / seconds - 0.5 * seconds * angular_acceleration
-        return ReadoutMotion(first_rate, velocity, angular_acceleration, acceleration, is_by_imu=True)
+    def by_imu(interval: ImuInterval, gyro_bias: Float, accel_bias: Float) -> ReadoutMotion:
+        """Return what an IMU measures of a readout: neither the velocity nor, without gravity, the acceleration."""
+        rates = _fitted(interval.steps_s, interval.angular_velocity - gyro_bias, _MAX_POWER_OF_RATE)
+        turning = ReadoutMotion(rates[0], np.zeros(3), rates[1], angular_jerk=2.0 * rates[2], is_by_imu=True)
+        middles_s, measured = np.cumsum(interval.steps_s) - 0.5 * interval.steps_s, interval.linear_acceleration
+        turns = middles_s[:, None] ** np.arange(1, 4) @ _columns(turning)[0]
+        turned = np.array([so3_exp(turn) @ force for turn, force in zip(turns, measured - accel_bias, strict=True)])
+        forces = _fitted(interval.steps_s, turned, 1)
+        return replace(turning, force=forces[0], jerk=forces[1])
+
+    def falling(self, velocity: Float, gravity: Float) -> ReadoutMotion:
+        """Return the motion with a velocity (3,) m/s and gravity (3,) m/s^2 downwards, in body at the stamp."""
+        return replace(self, velocity=velocity, acceleration=self.force + gravity)
 
     @staticmethod
     def steady(cur_T_prev: Float, seconds: float) -> ReadoutMotion:
@@ -108,16 +120,18 @@ def turned_rays(camera: Camera, pixels: Float, motion: ReadoutMotion) -> tuple[F
         Normalised coordinates (N, 2), and the rows (N, 4) of `graphvio.measurements.motion.CameraTracks.readout`.
     """
     rays, _ = camera.unproject(pixels)
-    return _turned(rays, 1e-6 * camera.line_time_us * pixels[:, 1], *_columns(motion), camera.body_T_cam)
+    by_force = replace(motion, velocity=np.zeros(3), acceleration=motion.force)
+    return _turned(rays, 1e-6 * camera.line_time_us * pixels[:, 1], *_columns(by_force), camera.body_T_cam)
 
 
 def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) -> TrackedFrame:
     """Return a frame whose points are as global shutters would have seen them at the stamp; pixels stay.
 
     The cameras of a pair have seen a point at nearly one instant, so that its depth is known before. A frame may be
-    compensated again, by another motion.
+    compensated again, by another motion; the depths of single cameras then stay those of the first time.
     """
-    if frame.shutter_px.any():  # back to where the lines have seen the points
+    was_at_stamp = bool(frame.shutter_px.any())
+    if was_at_stamp:  # back to where the lines have seen the points
         frame = replace(frame, shutter_px=np.zeros_like(frame.shutter_px)).recalibrated(group)
     depths = np.where(frame.has_depth, np.maximum(frame.points[:, 2], 0.0), 0.0)
     left_px, depths_then = pixels_at_stamp(group.left, frame.pixels, depths, motion)
@@ -125,6 +139,7 @@ def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) 
     shutter_px[:, 0] = left_px - frame.pixels
     if isinstance(group, SingleCamera):
         left, _ = group.left.unproject(left_px)
+        depths_then = frame.points[:, 2] if was_at_stamp else depths_then
         return replace(frame, left_rays=left, points=np.column_stack([left, depths_then]), shutter_px=shutter_px)
     right_T_left = group.right_T_left
     z = np.column_stack([frame.left_rays, np.ones(len(depths))]) @ right_T_left[2, :3] + depths * right_T_left[2, 3]
@@ -134,20 +149,34 @@ def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) 
 
 
 def _columns(motion: ReadoutMotion) -> tuple[Float, Float]:
-    """Return turn and shift as polynomials of time, (2, 3) each: the linear and the quadratic coefficients."""
-    turns = np.array([motion.angular_velocity, 0.5 * motion.angular_acceleration])
-    return turns, np.array([motion.velocity, 0.5 * motion.acceleration])
+    """Return turn and shift as polynomials of time, (3, 3) each: the coefficients of time and its powers."""
+    turns = np.array([motion.angular_velocity, 0.5 * motion.angular_acceleration, motion.angular_jerk / 6.0])
+    return turns, np.array([motion.velocity, 0.5 * motion.acceleration, motion.jerk / 6.0])
+
+
+def _fitted(steps_s: Float, means: Float, max_power: int) -> Float:
+    """Fit a polynomial of time to its means (N, 3) over steps: coefficients (max_power + 1, 3), the constant one first.
+
+    Where there are few steps, the highest ones are zero.
+    """
+    ends, n = np.cumsum(steps_s), min(max_power + 1, int((steps_s > 0.0).sum()))
+    powers = np.arange(1, n + 1)
+    integrals = (ends[:, None] ** powers - (ends - steps_s)[:, None] ** powers) / powers
+    found = np.zeros((max_power + 1, 3))
+    found[:n] = np.linalg.lstsq(integrals, means * steps_s[:, None], rcond=None)[0]
+    return found
 
 
 @kernel
 def _turned(rays: Float, times_s: Float, turns: Float, shifts: Float, body_T_cam: Float) -> tuple[Float, Float]:
-    """Turn rays (N, 2) back from times (N,) to the stamp; beside them these times, and the way without velocity."""
+    """Turn rays (N, 2) back from times (N,) to the stamp; beside them these times, and the camera's way."""
     turned, readout = rays.copy(), np.zeros((len(rays), 4))
     body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
     for i in range(len(rays)):
         t = times_s[i]
-        turn = so3_exp(t * turns[0] + t * t * turns[1])
-        readout[i, 0], readout[i, 1:] = t, t * t * shifts[1] + turn @ lever - lever
+        turn = so3_exp(t * turns[0] + t * t * turns[1] + t * t * t * turns[2])
+        way = t * shifts[0] + t * t * shifts[1] + t * t * t * shifts[2]
+        readout[i, 0], readout[i, 1:] = t, way + turn @ lever - lever
         ray = body_R_cam.T @ (turn @ (body_R_cam @ np.array([rays[i, 0], rays[i, 1], 1.0])))
         if ray[2] > 1e-6:
             turned[i] = ray[:2] / ray[2]
@@ -165,8 +194,9 @@ def _moved(
     body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
     for i in range(len(pixels)):
         t, w = times_s[i], inverse_depths[i]
-        turn = so3_exp(t * turns[0] + t * t * turns[1])
-        shift = body_R_cam.T @ (t * shifts[0] + t * t * shifts[1] + turn @ lever - lever)
+        turn = so3_exp(t * turns[0] + t * t * turns[1] + t * t * t * turns[2])
+        way = t * shifts[0] + t * t * shifts[1] + t * t * t * shifts[2]
+        shift = body_R_cam.T @ (way + turn @ lever - lever)
         turn = body_R_cam.T @ turn @ body_R_cam
         ray = np.array([rays[i, 0], rays[i, 1], 1.0])
         point = turn.T @ (ray - w * shift) if to_lines else turn @ ray + w * shift
