@@ -125,15 +125,15 @@ def _ate_of(folder: Path, name: str, config: Config) -> float:
     return ate_mm(folder, open_source(folder).rig.with_only(wanted), config)
 
 
-def ate_mm(folder: Path, rig: Rig, config: Config) -> float:
+def ate_mm(folder: Path, rig: Rig, config: Config, from_s: float = 0.0) -> float:
     """Run a rig's cameras and return the causal absolute trajectory error; infinite without poses."""
-    evaluation, _ = run(folder, rig, config)
+    evaluation, _ = run(folder, rig, config, from_s)
     return float("inf") if evaluation is None else 1e3 * evaluation.ate_position_m.rmse
 
 
-def run(folder: Path, rig: Rig, config: Config) -> tuple[Evaluation | None, float]:
+def run(folder: Path, rig: Rig, config: Config, from_s: float = 0.0) -> tuple[Evaluation | None, float]:
     """Run a rig's cameras and return the causal trajectory's errors, None without poses, and the share with pose."""
-    source = open_source(folder, rig)
+    source = open_source(folder, rig, from_s=from_s)
     assert source.truth is not None
     warm_up(source.rig, config)
     odometry = Odometry(source.rig, config)

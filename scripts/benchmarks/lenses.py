@@ -25,6 +25,7 @@ from graphvio.sources import open_source
 _SIZE_PX = (320, 240)
 _FIELD_OF_VIEW_DEG = 78.0
 _READOUT_MS = 20.0
+_FAST_RATE_HZ, _FAST_READOUT_MS, _MOVING_S = 30.0, 30.0, 4.0  # the walk turns then
 _PINHOLE = "pinhole"
 _LENSES: Mapping[str, tuple[str, Sequence[float]]] = {
     _PINHOLE: ("radial-tangential", []),
@@ -48,7 +49,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=f"Runs a stereo pair with IMU through the room, with images that are {_SIZE_PX[0]} pixels wide: "
         f"with each lens model at {_FIELD_OF_VIEW_DEG:g} degrees, and as high as a pinhole's view of {_SIZE_PX[1]} "
         f"pixels; with pinhole cameras whose lines are read out in {_READOUT_MS:g} ms, with and without the line time "
-        "in the rig; and with wide fisheyes of larger images, which see 160 degrees at most.",
+        f"in the rig, and in {_FAST_READOUT_MS:g} ms at {_FAST_RATE_HZ:g} Hz, from a turn on; and with wide fisheyes of "
+        "larger images, which see 160 degrees at most.",
         epilog="Example: scripts/benchmark lenses --seeds 1 --duration 10",
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
@@ -76,6 +78,16 @@ def run_all(args: argparse.Namespace) -> None:
         f"rolling, {_READOUT_MS:g} ms, not in the rig": _ates_mm(args, "rolling", rolling, has_line_time=False),
     }
     report.table(("shutter", "ATE, mm, median", "worst", "over global"), _rows(shutters, "global"))
+    line_time_us = 1e3 * _FAST_READOUT_MS / (_SIZE_PX[1] - 1)
+    fast = rig_of(_PINHOLE).with_cameras(lambda camera: replace(camera, line_time_us=line_time_us))
+    moving = partial(_ates_mm, args, rate_hz=_FAST_RATE_HZ, from_s=_MOVING_S)
+    shutters = {
+        "global": moving("global-fast", rig_of(_PINHOLE)),
+        f"rolling, {_FAST_READOUT_MS:g} ms": moving("rolling-fast", fast),
+        f"rolling, {_FAST_READOUT_MS:g} ms, without IMU": moving("rolling-fast", fast, has_imu=False),
+    }
+    head = (f"shutter, {_FAST_RATE_HZ:g} Hz, from {_MOVING_S:g} s on", "ATE, mm, median", "worst", "over global")
+    report.table(head, _rows(shutters, "global"))
     fisheyes = {
         (name, scene): _ates_mm(args, name.split(",")[0], fisheye_rig(*lens), scene)
         for name, lens in _FISHEYES.items()
@@ -126,15 +138,16 @@ def _rows(ates_mm: Mapping[str, Sequence[float]], base: str) -> list[tuple[str, 
 
 
 def _ates_mm(
-    args: argparse.Namespace, name: str, rig: Rig, scene: str = "room", has_line_time: bool = True
-) -> list[float]:
+    args: argparse.Namespace, name: str, rig: Rig, scene: str = "room", has_line_time: bool = True,
+    has_imu: bool = True, rate_hz: float | None = None, from_s: float = 0.0,
+) -> list[float]:  # fmt: skip
     found = []
     for seed in range(args.seeds):
-        render = partial(simulate, scene, seed=seed, duration_s=args.duration, rig=rig)
+        render = partial(simulate, scene, seed=seed, duration_s=args.duration, rate_hz=rate_hz, rig=rig)
         folder = rendered_once(args.data, scene, f"{name}-{args.duration:g}s-seed{seed}", render)
         known = open_source(folder).rig
         if not has_line_time:
             known = known.with_cameras(lambda camera: replace(camera, line_time_us=0.0))
-        found.append(ate_mm(folder, known, Config()))
+        found.append(ate_mm(folder, known if has_imu else known.without_imu(), Config(), from_s))
         log_progress(f"{name}, {scene}, seed {seed}: {found[-1]:.2f} mm")
     return found
