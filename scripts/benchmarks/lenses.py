@@ -49,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=f"Runs a stereo pair with IMU through the room, with images that are {_SIZE_PX[0]} pixels wide: "
         f"with each lens model at {_FIELD_OF_VIEW_DEG:g} degrees, and as high as a pinhole's view of {_SIZE_PX[1]} "
         f"pixels; with pinhole cameras whose lines are read out in {_READOUT_MS:g} ms, with and without the line time "
-        f"in the rig, and in {_FAST_READOUT_MS:g} ms at {_FAST_RATE_HZ:g} Hz, from a turn on; and with wide fisheyes of "
+        f"in the rig, and in {_FAST_READOUT_MS:g} ms at {_FAST_RATE_HZ:g} Hz from a turn on; and with wide fisheyes of "
         "larger images, which see 160 degrees at most.",
         epilog="Example: scripts/benchmark lenses --seeds 1 --duration 10",
     )
