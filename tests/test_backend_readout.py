@@ -62,7 +62,7 @@ def test_velocities_that_were_wrong_do_not_make_motions_wrong() -> None:
 
 
 def test_gate_knows_what_wrong_velocities_do() -> None:
-    """The first motion is off by 3 cm, and accepted; one that is off by as much for another reason is not."""
+    """The first motion is off by 3 cm, and accepted; one that is turned is not: the gyro knows that it has not."""
     for seed in range(6):
         run = RollingRun(seed).begin(has_factor=True)
         state = run.predict(PERIOD_NS)

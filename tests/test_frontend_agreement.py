@@ -127,7 +127,6 @@ def test_doubt_lasts_a_second() -> None:
         correspondences = Correspondences(seen, {}, {})
         tracked = TrackedFrameset(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, correspondences, None)
         agreement, _ = frontend._estimate_motion(tracked, lambda _: STILL)
-        frontend._note_contradiction(tracked.stamp_ns, agreement)
         assert agreement is not None
         sides[milliseconds] = len(agreement.hypotheses)
     frontend.close()

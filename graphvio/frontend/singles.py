@@ -110,11 +110,11 @@ class SinglesFrontend(TrackingFrontend):
             chosen = ~of_others[j] if wanted is None else wanted[j]
             self._overlaps.find(j, images, lambda then_ns: self._moved(j, motion_since(then_ns)), searches, chosen)
             matches, handed_over = self._overlaps.matches_of(j, frames[j]), self._handover.handed_over(j, frames[j])
-            camera, pixels = self._of_file[j], frames[j].pixels
-            if camera.line_time_us and seen.readout is not None:
-                rays, readout = turned_rays(camera, pixels, seen.readout)
+            camera = self._of_file[j]
+            if camera.line_time_us and seen.readout is not None and seen.readout.is_by_imu:
+                rays, readout = turned_rays(camera, frames[j].pixels, seen.readout)
                 return CameraTracks(frames[j].ids, rays, matches, handed_over, readout)
-            rays, _ = camera.unproject(pixels)
+            rays, _ = camera.unproject(frames[j].pixels_at_stamp)
             return CameraTracks(frames[j].ids, rays, matches, handed_over)
 
         return self._in_parallel(find, frames)

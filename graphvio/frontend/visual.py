@@ -96,13 +96,15 @@ class VisualFrontend(TrackingFrontend):
 
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset."""
+        contradicted_ns = self._contradicted_ns
         agreement, reason = self._estimate_motion(seen, motion_since)
         if self._readouts is not None:
             if agreement is not None:
-                seen, agreement, reason = self._with_shown_velocities(seen, self._readouts, agreement, motion_since)
+                seen, agreement, reason = self._with_shown_velocities(
+                    seen, self._readouts, agreement, motion_since, contradicted_ns
+                )
             self._readouts.keep(seen, self._references)
             self.are_velocities_known = self._readouts.is_known(seen)
-        self._note_contradiction(seen.stamp_ns, agreement)
         few = self._fit_few_points(seen, motion_since) if agreement is None else None
         judged = self._judge(seen, agreement, reason, motion_since)
         if agreement is not None and judged.quality is Quality.GOOD:
@@ -138,6 +140,8 @@ class VisualFrontend(TrackingFrontend):
             refined, observations = joint_motion(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
             agreement = agree(arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt)
+            if agreement.contradicts:
+                self._contradicted_ns = seen.stamp_ns
         else:
             refined = best_pair_motion(arrays, observations, start, config, rng)
             agreement = Agreement((MotionHypothesis(observations.pairs, refined),), {})
@@ -148,14 +152,23 @@ class VisualFrontend(TrackingFrontend):
         return agreement, ""
 
     def _with_shown_velocities(
-        self, seen: TrackedFrameset, readouts: Readouts, agreement: Agreement, motion_since: MotionPredictor
+        self,
+        seen: TrackedFrameset,
+        readouts: Readouts,
+        agreement: Agreement,
+        motion_since: MotionPredictor,
+        contradicted_ns: int | None,
     ) -> tuple[TrackedFrameset, Agreement | None, str]:
-        """Measure a motion by rolling shutters again with the velocities that it shows, where no state knows them."""
+        """Measure a motion by rolling shutters again with the velocities that it shows, where no state knows them.
+
+        Until then the pairs last contradicted each other at ``contradicted_ns``: with wrong velocities they may do so.
+        """
         readouts.note(seen, agreement.hypotheses[0].refined.cur_T_ref)
         again = readouts.compensated_by_motion(seen, self._trackers, self._references, self._rig)
         if again is None:
             return seen, agreement, ""
         self._latest.update(again.frames)
+        self._contradicted_ns = contradicted_ns
         better, reason = self._estimate_motion(again, motion_since)
         if better is not None:
             readouts.note(again, better.hypotheses[0].refined.cur_T_ref)
@@ -280,11 +293,6 @@ class VisualFrontend(TrackingFrontend):
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
         for j in seen.frames:
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
-
-    def _note_contradiction(self, now_ns: int, agreement: Agreement | None) -> None:
-        """Note whether the pairs contradict each other."""
-        if agreement is not None and agreement.contradicts:
-            self._contradicted_ns = now_ns
 
     def _is_in_doubt(self, now_ns: int) -> bool:
         """Whether the pairs contradicted each other a moment ago."""

@@ -173,8 +173,9 @@ class FramesetImu:
         body_R_nav = state.nav_T_body[:3, :3].T
         readout = ReadoutMotion.by_imu(interval, state.gyro_bias, state.accel_bias)
         readout = readout.falling(body_R_nav @ state.velocity_nav, body_R_nav @ state.gravity_nav)
+        # The covariance is that of the last frameset: after an initialisation since then it is not of this state.
         covariance, initialisations = self._estimator.covariance.velocity, self._initialisations
-        self._initialisations = self._estimator.initialisations  # since the last frameset, of which the covariance is
+        self._initialisations = self._estimator.initialisations
         if covariance is None or initialisations != self._initialisations:
             return readout
         if np.linalg.eigvalsh(covariance)[-1] > _MAX_VELOCITY_SIGMA_M_S**2:

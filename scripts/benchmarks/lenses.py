@@ -65,6 +65,8 @@ def run_all(args: argparse.Namespace) -> None:
     """Measure and report."""
     if args.seeds < 1:
         raise GraphvioError("--seeds must be at least 1")
+    if not args.duration > _MOVING_S + 1.0:
+        raise GraphvioError(f"--duration must be more than {_MOVING_S + 1.0:g}: some walks begin at {_MOVING_S:g} s")
     report = Report()
     report.add(machine())
     lenses = [_PINHOLE, *(name for name in args.lenses if name != _PINHOLE)]

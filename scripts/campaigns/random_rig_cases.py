@@ -16,6 +16,7 @@ SCENES = ("room", "corridor", "stairs", "calibration")
 _SIZES_PX = ((320, 240), (512, 512), (640, 400), (640, 480), (752, 480))
 _RATES_HZ = (8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0)
 _MAX_READOUT_US = 33e3
+MAX_BEGIN_S = 5.0
 _IMU_RATES_HZ = (100.0, 200.0, 400.0)
 _LENSES = {
     "radial-tangential": ([-0.28, 0.07, 2e-4, 2e-5], 100.0),
@@ -98,7 +99,7 @@ def sample_rig(seed: int) -> RandomRig:
     if random.random() < 0.3:
         readout_us = random.uniform(0.2, 0.95) * min(1e6 / rate_hz, _MAX_READOUT_US)
         rig = rig.with_cameras(lambda camera: replace(camera, line_time_us=readout_us / camera.size_px[1]))
-    begin_s = float(random.uniform(1.5, 5.0)) if random.random() < 0.5 else 0.0
+    begin_s = float(random.uniform(1.5, MAX_BEGIN_S)) if random.random() < 0.5 else 0.0
     return RandomRig(rig, scene, rate_hz, trigger_offset_ms, begin_s)
 
 

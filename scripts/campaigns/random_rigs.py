@@ -24,7 +24,7 @@ from benchmarks.recordings import add_data_option, rendered_once
 from benchmarks.report import Report, log_progress, machine
 
 from campaigns import random_rig_cases
-from campaigns.random_rig_cases import RandomRig, sample_rig
+from campaigns.random_rig_cases import MAX_BEGIN_S, RandomRig, sample_rig
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.measurements.events import EventKind
@@ -50,6 +50,8 @@ _NOTABLE = (
 _KINDS: dict[str, Callable[[RandomRig], bool]] = {
     "with pairs": lambda sampled: bool(sampled.rig.pairs),
     "of single cameras": lambda sampled: not sampled.rig.pairs,
+    "with rolling shutters": lambda sampled: sampled.rig.cameras[0].readout_ns > 0,
+    "from motion on": lambda sampled: sampled.begin_s > 0.0,
 }
 
 
@@ -96,8 +98,10 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def main(args: argparse.Namespace) -> None:
     """Run the campaign and report."""
-    if args.rigs < 1 or args.first < 0 or not args.duration > 0.0:
-        raise GraphvioError("--rigs must be 1 or more, --first not negative, and --duration positive")
+    if args.rigs < 1 or args.first < 0 or not args.duration > MAX_BEGIN_S + 1.0:
+        raise GraphvioError(
+            f"--rigs must be 1 or more, --first not negative, and --duration more than {MAX_BEGIN_S + 1.0:g}"
+        )
     report = Report()
     report.add(machine())
     results: list[_Result] = []

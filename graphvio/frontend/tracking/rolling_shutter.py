@@ -20,7 +20,8 @@ from graphvio.rig import Camera, CameraGroup, SingleCamera
 
 _ROUNDS = 3  # a point's line depends on its pixel, and its pixel on the line
 _MIN_Z = 1e-3
-_MAX_POWER_OF_RATE = 2  # of time; at the end of a turn, the rate of 40 ms is no linear function
+_MAX_POWER_OF_RATE = 2  # rates are fitted by parabolas: over a readout of 40 ms a turn that ends is not linear
+_MIN_SHARE_OF_LONGEST = 0.2  # of steps that count for that: between bursts of samples no parabola is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,8 @@ class ReadoutMotion:
         acceleration: (3,) m/s^2 at the stamp, frame body at the stamp.
         angular_jerk: (3,) rad/s^3, frame body.
         jerk: (3,) m/s^3, frame body at the stamp.
-        force: (3,) m/s^2 specific force at the stamp, the acceleration without gravity, which may not be known.
+        force: (3,) m/s^2 what the accelerometer measures at the stamp, in body there: acceleration less gravity. Zero
+            where no IMU measures it.
         velocity_covariance: (3, 3) of the velocity, (m/s)^2, or None where it is but a guess.
         is_by_imu: Whether an IMU has measured turn and acceleration.
     """
@@ -51,7 +53,7 @@ class ReadoutMotion:
 
     @staticmethod
     def by_imu(interval: ImuInterval, gyro_bias: Float, accel_bias: Float) -> ReadoutMotion:
-        """Return what an IMU measures of a readout: neither the velocity nor, without gravity, the acceleration."""
+        """Return what an IMU measures of a readout; velocity and acceleration are zero, until `falling` gives them."""
         rates = _fitted(interval.steps_s, interval.angular_velocity - gyro_bias, _MAX_POWER_OF_RATE)
         turning = ReadoutMotion(rates[0], np.zeros(3), rates[1], angular_jerk=2.0 * rates[2], is_by_imu=True)
         middles_s, measured = np.cumsum(interval.steps_s) - 0.5 * interval.steps_s, interval.linear_acceleration
@@ -157,9 +159,10 @@ def _columns(motion: ReadoutMotion) -> tuple[Float, Float]:
 def _fitted(steps_s: Float, means: Float, max_power: int) -> Float:
     """Fit a polynomial of time to its means (N, 3) over steps: coefficients (max_power + 1, 3), the constant one first.
 
-    Where there are few steps, the highest ones are zero.
+    Where there are few steps, or most of them are short, the coefficients of the highest powers are zero.
     """
-    ends, n = np.cumsum(steps_s), min(max_power + 1, int((steps_s > 0.0).sum()))
+    counted = int((steps_s >= _MIN_SHARE_OF_LONGEST * steps_s.max()).sum())
+    ends, n = np.cumsum(steps_s), min(max_power + 1, counted)
     powers = np.arange(1, n + 1)
     integrals = (ends[:, None] ** powers - (ends - steps_s)[:, None] ** powers) / powers
     found = np.zeros((max_power + 1, 3))
