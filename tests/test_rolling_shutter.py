@@ -210,6 +210,18 @@ def test_framesets_wait_for_the_imu_of_their_last_line() -> None:
     assert synchroniser.next_due(initialised=True) is not None
 
 
+def test_the_first_frameset_waits_for_the_imu_of_its_last_line() -> None:
+    """Though there are samples enough from before it, to initialise by."""
+    synchroniser = Synchroniser(small_rig(1).with_cameras(rolling), Config(), lambda *_: None)
+    for stamp_ns in range(0, 1_010_000_000, 5_000_000):
+        synchroniser.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, 9.81])))
+    synchroniser.add_frameset(FrameSet(1_000_000_000, {}))
+    assert synchroniser.next_due(initialised=False) is None
+    for stamp_ns in (1_010_000_000, 1_015_000_000, 1_020_000_000):
+        synchroniser.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, 9.81])))
+    assert synchroniser.next_due(initialised=False) is not None
+
+
 def test_line_times_that_make_no_sense_are_refused() -> None:
     rig = small_rig(1)
     with pytest.raises(RigError, match=r"camera cam0: line_time_us is 41000\.0; it must be in microseconds"):
@@ -463,12 +475,11 @@ def walk() -> Path:
 
 
 def ate_m(walk: Path, rig: Rig, begin_s: float = 0.0) -> float:
-    source = open_source(walk, rig)
+    """Begun in the walk, with the IMU's samples from just before as a live source has them."""
+    source = open_source(walk, rig, from_s=begin_s)
     assert source.truth is not None
-    odometry, truth = Odometry(source.rig), load_trajectory(source.truth)
-    begin_ns = int(truth.stamps_ns[0]) + round(1e9 * begin_s)
-    measured = [each for each in source if each.stamp_ns >= begin_ns]
-    estimates = [each for each in map(odometry.process, measured) if each is not None] + odometry.finish()
+    odometry = Odometry(source.rig)
+    estimates = [each for each in map(odometry.process, source) if each is not None] + odometry.finish()
     posed = [each for each in estimates if each.nav_T_body is not None]
     poses: Float = np.array([each.nav_T_body for each in posed])
     estimated = Trajectory(np.array([each.stamp_ns for each in posed], dtype=np.int64), poses)

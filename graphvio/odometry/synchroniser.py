@@ -279,6 +279,8 @@ class Synchroniser:
             if self.precedes_imu(frameset.stamp_ns):
                 return True
             enough = self.initial_interval(frameset.stamp_ns) is not None
+            if self._readout_ns:  # its lines need the IMU, too
+                enough &= self.interval_after(frameset.stamp_ns, self._readout_ns) is not None
             return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
         at_ns, newest_ns = self._expected_instant_ns(frameset) + self._offset_ns, self._imu.newest_ns
         if newest_ns is None or newest_ns >= at_ns + self._readout_ns:
