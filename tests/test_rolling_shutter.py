@@ -444,34 +444,30 @@ def test_views_of_a_single_camera_are_from_where_its_lines_see_them() -> None:
     assert np.median(errors2[1]) > 1.0
 
 
+def rendered_room(name: str, rig: Rig, duration_s: float, rate_hz: float = 20.0) -> Path:
+    """A walk through the room, rendered once."""
+
+    def write(folder: Path) -> None:
+        write_recording(Simulator(build_scene("room", duration_s), rig, 1, rate_hz=rate_hz), folder)
+
+    return rendered_once(f"room-{name}", write, "320x240", duration_s)
+
+
 @pytest.fixture(scope="module")
 def fast_walk() -> Path:
     """Images at 30 Hz that are read out in 30 ms."""
-
-    def write(folder: Path) -> None:
-        line_us = 30e3 / 240
-        rig = stereo().with_cameras(half_size).with_cameras(lambda camera: replace(camera, line_time_us=line_us))
-        write_recording(Simulator(build_scene("room", 4.0), rig, 1, rate_hz=30.0), folder)
-
-    return rendered_once("room-rolling-30hz", write, "320x240", 4.0)
+    rig = stereo().with_cameras(half_size).with_cameras(lambda camera: replace(camera, line_time_us=30e3 / 240))
+    return rendered_room("rolling-30hz", rig, 4.0, 30.0)
 
 
 @pytest.fixture(scope="module")
 def two_pairs() -> Path:
-    def write(folder: Path) -> None:
-        rig = default_rig().with_cameras(half_size).with_cameras(rolling)
-        write_recording(Simulator(build_scene("room", 3.5), rig, 1, rate_hz=10.0), folder)
-
-    return rendered_once("room-rolling-two-pairs", write, "320x240", 3.5)
+    return rendered_room("rolling-two-pairs", default_rig().with_cameras(half_size).with_cameras(rolling), 3.5, 10.0)
 
 
 @pytest.fixture(scope="module")
 def walk() -> Path:
-    def write(folder: Path) -> None:
-        rig = stereo().with_cameras(half_size).with_cameras(rolling)
-        write_recording(Simulator(build_scene("room", DURATION_S), rig, 1), folder)
-
-    return rendered_once("room-rolling", write, "320x240", DURATION_S)
+    return rendered_room("rolling", stereo().with_cameras(half_size).with_cameras(rolling), DURATION_S)
 
 
 def ate_m(walk: Path, rig: Rig, begin_s: float = 0.0) -> float:
@@ -553,11 +549,7 @@ def test_a_single_camera_is_as_accurate_with_a_rolling_shutter() -> None:
     for line_time_us in (0.0, READOUT_US / 240):
         small = phone().with_cameras(half_size)
         rig = replace(small, singles=(SingleCamera(replace(small.cameras[0], line_time_us=line_time_us)),))
-
-        def write(folder: Path, rig: Rig = rig) -> None:
-            write_recording(Simulator(build_scene("room", 6.0), rig, 1), folder)
-
-        walk = rendered_once(f"room-phone-{line_time_us:.0f}", write, "320x240", 6.0)
+        walk = rendered_room(f"phone-{line_time_us:.0f}", rig, 6.0)
         ates_m.append(ate_m(walk, open_source(walk).rig, 1.0))
     assert ates_m[1] < 0.01
     assert ates_m[1] < 1.5 * ates_m[0]

@@ -213,7 +213,6 @@ class Smoother:
 
         The predicted motion (4, 4) is from the pose with the key ``reference``.
         """
-        self._has_rolling_shutter = True
         states = [self.state(motion.stamp_ns), self.state(motion.reference_stamp_ns)]
         nav_R_body = np.array([state.nav_T_body[:3, :3] for state in states])
         in_body = np.array([state.nav_T_body[:3, :3].T @ state.velocity_nav for state in states])
@@ -285,6 +284,7 @@ class Smoother:
             measured = gtsam.Pose3(motion.reference_T_current)
             self._window.add(gtsam.BetweenFactorPose3(reference, x(newest), measured, noise))
         else:
+            self._has_rolling_shutter = True
             self._window.add(readout_factor(reference, x(newest), (v(newest), v(k)), motion, noise))
 
     def update(self, keep: Iterable[int]) -> list[tuple[int, Float]]:

@@ -31,10 +31,6 @@ class Readouts:
         self._measured = MeasuredReadouts(max(camera.readout_ns for camera in rig.cameras))
         self._applied: dict[int, ReadoutMotion] = {}  # by stamp
 
-    def is_known(self, seen: TrackedFrameset) -> bool:
-        """Whether the velocity is known by which a frameset was compensated."""
-        return seen.readout is not None and seen.readout.velocity_covariance is not None
-
     def keep(self, seen: TrackedFrameset, references: References) -> None:
         """Remember the motion of a frameset, which may become a reference, and forget those that are none."""
         self._applied = {ns: each for ns, each in self._applied.items() if ns in references.stamps_ns}
@@ -61,8 +57,7 @@ class Readouts:
         Returns:
             The frameset, or None where velocities are known, or motions do not show them.
         """
-        of_reference = self._applied.get(seen.reference_stamp_ns)
-        if self.is_known(seen) and of_reference is not None and of_reference.velocity_covariance is not None:
+        if is_velocity_known(seen.readout) and is_velocity_known(self._applied.get(seen.reference_stamp_ns)):
             return None
         now, then = self._measured.at(seen.stamp_ns), self._measured.at(seen.reference_stamp_ns)
         if now is None or then is None:
@@ -104,6 +99,11 @@ class Readouts:
             then = np.searchsorted(reference.ids, frame.ids[rows])
             parts.append(self._line_s[j] * np.array([frame.pixels[rows, 1], reference.pixels[then, 1]]))
         return np.ascontiguousarray(np.hstack(parts))
+
+
+def is_velocity_known(readout: ReadoutMotion | None) -> bool:
+    """Whether a velocity by which rolling shutters are compensated is known, and not only a guess."""
+    return readout is not None and readout.velocity_covariance is not None
 
 
 def _by_imu(readout: ReadoutMotion | None) -> ReadoutMotion | None:

@@ -21,7 +21,7 @@ from graphvio.frontend.motion.refinement import Refined
 from graphvio.frontend.motion.selection import best_pair_motion, joint_motion
 from graphvio.frontend.pairs.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.pairs.pair_reports import inliers_of, pair_reports
-from graphvio.frontend.readouts import Readouts
+from graphvio.frontend.readouts import Readouts, is_velocity_known
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.geometry import se3_inverse, so3_log
@@ -104,7 +104,7 @@ class VisualFrontend(TrackingFrontend):
                     seen, self._readouts, agreement, motion_since, contradicted_ns
                 )
             self._readouts.keep(seen, self._references)
-            self.are_velocities_known = self._readouts.is_known(seen)
+            self.are_velocities_known = is_velocity_known(seen.readout)
         few = self._fit_few_points(seen, motion_since) if agreement is None else None
         judged = self._judge(seen, agreement, reason, motion_since)
         if agreement is not None and judged.quality is Quality.GOOD:

@@ -79,6 +79,7 @@ class _Views(NamedTuple):
 
     @staticmethod
     def of(structure: Structure, cameras: Cameras) -> _Views:
+        """Collect the views of landmarks that a camera sees twice at least."""
         n_cameras = len(cameras.body_T_cam)
         point = np.repeat(np.arange(len(structure.odom_T_landmark)), np.diff(structure.rows))
         _, landmark, counts = np.unique(point * n_cameras + structure.camera, return_inverse=True, return_counts=True)

@@ -171,15 +171,20 @@ def _fitted(steps_s: Float, means: Float, max_power: int) -> Float:
 
 
 @kernel
+def _turn_and_way(t: float, turns: Float, shifts: Float, lever: Float) -> tuple[Float, Float]:
+    """Return how body turns (3, 3) until a time after the stamp, and the way (3,) of a camera at a lever in body."""
+    turn = so3_exp(t * turns[0] + t * t * turns[1] + t * t * t * turns[2])
+    return turn, t * shifts[0] + t * t * shifts[1] + t * t * t * shifts[2] + turn @ lever - lever
+
+
+@kernel
 def _turned(rays: Float, times_s: Float, turns: Float, shifts: Float, body_T_cam: Float) -> tuple[Float, Float]:
     """Turn rays (N, 2) back from times (N,) to the stamp; beside them these times, and the camera's way."""
     turned, readout = rays.copy(), np.zeros((len(rays), 4))
     body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
     for i in range(len(rays)):
-        t = times_s[i]
-        turn = so3_exp(t * turns[0] + t * t * turns[1] + t * t * t * turns[2])
-        way = t * shifts[0] + t * t * shifts[1] + t * t * t * shifts[2]
-        readout[i, 0], readout[i, 1:] = t, way + turn @ lever - lever
+        turn, way = _turn_and_way(times_s[i], turns, shifts, lever)
+        readout[i, 0], readout[i, 1:] = times_s[i], way
         ray = body_R_cam.T @ (turn @ (body_R_cam @ np.array([rays[i, 0], rays[i, 1], 1.0])))
         if ray[2] > 1e-6:
             turned[i] = ray[:2] / ray[2]
@@ -196,10 +201,9 @@ def _moved(
     limit = fold_radius(model, distortion)
     body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
     for i in range(len(pixels)):
-        t, w = times_s[i], inverse_depths[i]
-        turn = so3_exp(t * turns[0] + t * t * turns[1] + t * t * t * turns[2])
-        way = t * shifts[0] + t * t * shifts[1] + t * t * t * shifts[2]
-        shift = body_R_cam.T @ (way + turn @ lever - lever)
+        w = inverse_depths[i]
+        turn, way = _turn_and_way(times_s[i], turns, shifts, lever)
+        shift = body_R_cam.T @ way
         turn = body_R_cam.T @ turn @ body_R_cam
         ray = np.array([rays[i, 0], rays[i, 1], 1.0])
         point = turn.T @ (ray - w * shift) if to_lines else turn @ ray + w * shift
