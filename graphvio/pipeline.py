@@ -10,7 +10,6 @@ from time import perf_counter
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.config import Config
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.sensors import FrameSet
@@ -18,7 +17,6 @@ from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import Step
 from graphvio.results import FinishedRun, ResultWriter, Summary
-from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import described
 from graphvio.sources import Source
@@ -83,34 +81,27 @@ class RunListener:
     on_progress: Callable[[Progress], None] = _ignore
 
 
-def run(
-    source: Source,
-    config: Config,
-    writer: ResultWriter,
-    listeners: Sequence[RunListener] = (),
-    rig: Rig | None = None,
-) -> Summary:
+def run(source: Source, odometry: Odometry, writer: ResultWriter, listeners: Sequence[RunListener] = ()) -> Summary:
     """Run the odometry over a source and write the results.
 
     Args:
         source: of the measurements.
-        config: of the odometry.
+        odometry: that has processed nothing yet, of the source's rig, or of the same with another calibration.
         writer: of the results.
         listeners: called in this order.
-        rig: with another calibration than the source's; None for the source's.
 
     Raises:
         GraphvioError: if the source cannot be read or the folder not written.
     """
-    return _Run(source, config, writer, listeners, rig or source.rig).execute()
+    return _Run(source, odometry, writer, listeners).execute()
 
 
 class _Run:
     def __init__(
-        self, source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener], rig: Rig
+        self, source: Source, odometry: Odometry, writer: ResultWriter, listeners: Sequence[RunListener]
     ) -> None:
         self._source = source
-        self._odometry = Odometry(rig, config)
+        self._odometry = odometry
         for listener in listeners:
             self._odometry.subscribe(listener.on_step)
             if listener.on_views is not _ignore:

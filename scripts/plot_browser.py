@@ -13,7 +13,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from browser import CHROMIUM, Browser, free_options  # noqa: E402
 
-from graphvio import Config, open_source  # noqa: E402
+from graphvio import Config, Odometry, open_source  # noqa: E402
 from graphvio.pipeline import RunListener, run  # noqa: E402
 from graphvio.results import ResultWriter  # noqa: E402
 from graphvio.runtime import set_up_threads  # noqa: E402
@@ -39,7 +39,7 @@ def main(picture: Path) -> int:
                 on_estimate=viewer.show, on_event=viewer.show_event, on_calibration=viewer.show_calibration
             )
             with ResultWriter(folder / "results", source.rig, config.to_yaml()) as writer:
-                run(source, config, writer, [shown])
+                run(source, Odometry(source.rig, config), writer, [shown])
             until = time.monotonic() + RENDERED_S
             while time.monotonic() < until:
                 image = browser.screenshot()

@@ -51,7 +51,7 @@ def test_run_corridor_has_no_reset_and_bounded_drift(
     """The back pair alone ends 0.5 to 1.0 % of the path off, with the noise of the images: that has no bound."""
     rig = open_source(corridor).rig.with_pairs(pairs)
     with ResultWriter(tmp_path / "out", rig, Config().to_yaml()) as writer:
-        summary = run(open_source(corridor, rig), Config(), writer)
+        summary = run(open_source(corridor, rig), Odometry(rig, Config()), writer)
     assert summary.completion == 1.0
     assert summary.resets == 0
     assert summary.status["coasting"] >= 20  # a second at the bend, where neither pair sees texture

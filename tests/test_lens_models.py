@@ -8,6 +8,7 @@ from rendered import rendered_once
 
 from graphvio import load_rig
 from graphvio.config import Config
+from graphvio.odometry import Odometry
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.simulation import Simulator, build_scene, write_recording
@@ -30,7 +31,7 @@ def test_run_with_double_spheres_is_as_accurate_as_with_other_lenses(tmp_path: P
         assert {camera.model for camera in load_rig(recording / place).cameras} == {"double-sphere"}
     source = open_source(recording)
     with ResultWriter(tmp_path / "out", source.rig, Config().to_yaml()) as writer:
-        summary = run(source, Config(), writer)
+        summary = run(source, Odometry(source.rig, Config()), writer)
     assert (summary.completion, summary.resets) == (1.0, 0)
     assert summary.evaluation is not None
     assert summary.evaluation["ate_percent"] < 0.1

@@ -224,15 +224,16 @@ def test_optimize_killed_run_continues_to_equal_results(
     line += ["--out", out]
     process = subprocess.Popen([str(part) for part in line], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120.0
-    while not (out / "database.db").exists() and process.poll() is None and time.monotonic() < deadline:
+    while not (out / "walk/features-ahead.db").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     finished = json.loads((out / "stages.json").read_text())["finished"]
-    assert list(finished) == ["calibration of walk"]  # features are extracted while the odometry runs
+    assert not finished  # features are extracted while the odometry runs
     assert command(short_walk, "--config", settings, "--out", out).exit_code == 0
     for name in ALWAYS_EQUAL:
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
+    assert not (out / "walk/features-ahead.db").exists()
 
 
 def test_record_with_features_extracts_first_places(walk: Path, settings: Path, tmp_path: Path) -> None:
@@ -270,6 +271,27 @@ def test_optimize_missing_files_are_written_again(done: Path, short_walk: Path, 
     assert command(short_walk, "--config", settings, "--out", out).exit_code == 0
     for name in (*ALWAYS_EQUAL, "colmap/sparse/0/points3D.bin", "summary.json"):
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
+
+
+def test_optimize_exact_file_runs_the_odometry_once(done: Path) -> None:
+    assert Config.load(done / "walk/odometry/config.yaml").calibration.online
+    finished = json.loads((done / "stages.json").read_text())["finished"]
+    assert list(finished)[:3] == ["odometry of walk", "calibration of walk", "features of walk"]
+
+
+def test_calibrate_wrong_file_keeps_nothing_measured_with_it(walk: Path, tmp_path: Path) -> None:
+    wrong = draw(open_source(walk).rig, CalibrationErrorSizes.of_level(3, ["left-right-rotation"]), seed=1).written_rig
+    out = tmp_path / "out"
+    stages = Stages([Session("walk", open_source(walk, wrong, to_s=4.0))], out, Config())
+    stages.calibrate(0, with_features=True)
+    assert list(json.loads((out / "stages.json").read_text())["finished"]) == ["calibration of walk"]
+    assert not (out / DATABASE).exists()
+    assert not (out / "walk/features-ahead.db").exists()
+    stages.record(0)
+    assert not Config.load(out / "walk/odometry/config.yaml").calibration.online
+    used, refined = (load_rig(out / "walk" / name).pairs[0].right_T_left for name in ("odometry", "rig-refined.yaml"))
+    np.testing.assert_allclose(used, refined, atol=1e-9)
+    assert np.abs(used - wrong.pairs[0].right_T_left).max() > 1e-4
 
 
 def test_optimize_exact_file_stays(short_walk: Path, done: Path) -> None:

@@ -7,6 +7,7 @@ from recordings import scaled
 from rendered import rendered_once
 
 from graphvio.config import Config
+from graphvio.odometry import Odometry
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.simulation import Simulator, build_scene, write_recording
@@ -31,7 +32,7 @@ def test_run_outdoors_has_no_reset_and_bounded_error(
     recording = rendered_once(scene, write, "0.375 size", DURATION_S)
     source = open_source(recording)
     with ResultWriter(tmp_path / "out", source.rig, Config().to_yaml()) as writer:
-        summary = run(source, Config(), writer)
+        summary = run(source, Odometry(source.rig, Config()), writer)
     assert summary.completion == 1.0
     assert summary.resets == 0
     assert summary.evaluation is not None

@@ -41,7 +41,7 @@ def summary_of(recording: Path, rig: Rig, out: Path, config: Config | None = Non
     config = config or Config()
     source = open_source(recording, rig)
     with undrawn(), ResultWriter(out, source.rig, config.to_yaml()) as writer:
-        return run(source, config, writer)
+        return run(source, Odometry(source.rig, config), writer)
 
 
 # ------------------------------------------------------------------ rig files

@@ -53,6 +53,7 @@ def run(
 
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
+    from graphvio.odometry import Odometry
     from graphvio.pipeline import RunListener
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
@@ -74,7 +75,7 @@ def run(
         warm_up_visibly(opened.rig, settings, wait_for_calibration=False)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
         with ends_at_interrupt(f"interrupted; what was estimated until then is in {folder}"):
-            summary = run_pipeline(opened, settings, writer, listeners)
+            summary = run_pipeline(opened, Odometry(opened.rig, settings), writer, listeners)
     publish(asdict(summary) | {"results": str(folder)})
     _print_summary(summary, folder)
     if summary.completion < MIN_COMPLETION:

@@ -195,44 +195,12 @@ def calibrate_recording(
         CalibrationError: if the rig cannot be calibrated so, or hardly moved.
         RigError: if the stereo extrinsics are to be calibrated, and there is no pair.
     """
-    config = replace(config or Config(), calibration=CalibrationConfig(online=True))
-    if not config.estimates_calibration:
-        raise CalibrationError(f"motion.reference is {config.motion.reference}: calibration wants tracks of keyframes")
     if what == "stereo":
         rig.need_pairs("the calibration of left to right")
     if what == "imu" and rig.imu is None:
         raise CalibrationError(f"{rig.name} has no IMU to calibrate")
-    windows, odometry, end_ns = _windows(measurements, rig, config, on_progress)
-    if len(windows) < _MIN_WINDOWS:
-        raise CalibrationError(
-            f"the images hardly move, or are not tracked: {len(windows)} windows of keyframes, and at least "
-            f"{_MIN_WINDOWS} are wanted; walk for half a minute with turns, near textured surfaces"
-        )
-    prior_rig = _with_fixed(rig, _FIXED[what])
-    online = odometry.calibration
-    assert online is not None, "the configuration asks for it"
-    judged = end_ns, online.is_file_exact, odometry.calibration_findings, odometry.clock_shift_s
-    batch = calibrate_windows(prior_rig, windows, online.posterior.mean, lambda k, n: on_progress("all windows", k, n))
-    if sum(batch.left_out) > len(windows) // 2:
-        raise CalibrationError(
-            f"{sum(batch.left_out)} of {len(windows)} windows contradict the others, or fit no calibration: did it "
-            "change on the way, or is what is kept as in the file wrong (--what all)?"
-        )
-    if len(windows) < _MIN_OF_HALVES or not compares_halves:
-        return RecordedCalibration(what, rig, batch, None, *judged)
-    middle, mean = len(windows) // 2, batch.estimate.posterior.mean
-    first = calibrate_windows(prior_rig, windows[:middle], mean, lambda k, n: on_progress("first half", k, n))
-    second = calibrate_windows(prior_rig, windows[middle:], mean, lambda k, n: on_progress("second half", k, n))
-    return RecordedCalibration(what, rig, batch, (first, second), *judged)
-
-
-def _windows(
-    measurements: Iterable[Measurement], rig: Rig, config: Config, on_progress: Progress
-) -> tuple[list[FullWindow], Odometry, int]:
-    """Return the full windows of a recording, the odometry at its end, and the stamp of the last frameset."""
-    windows: list[FullWindow] = []
-    odometry = Odometry(rig, config)
-    odometry.on_full_window(windows.append)
+    odometry = Odometry(rig, calibrating(config or Config()))
+    windows = CalibrationWindows(odometry)
     count = end_ns = 0
     for measurement in measurements:
         odometry.process(measurement)
@@ -240,7 +208,70 @@ def _windows(
             count, end_ns = count + 1, measurement.stamp_ns
             on_progress("odometry", count, 0)
     odometry.finish()
-    return windows, odometry, end_ns
+    return windows.calibrate(what, end_ns, on_progress, compares_halves)
+
+
+def calibrating(config: Config) -> Config:
+    """Return a configuration of an odometry that estimates the calibration.
+
+    Raises:
+        CalibrationError: if it cannot do so.
+    """
+    config = replace(config, calibration=CalibrationConfig(online=True))
+    if not config.estimates_calibration:
+        raise CalibrationError(f"motion.reference is {config.motion.reference}: calibration wants tracks of keyframes")
+    return config
+
+
+class CalibrationWindows:
+    """Collects all windows of an odometry's self-calibration, from which the recording's rig is calibrated.
+
+    Args:
+        odometry: that estimates the calibration, see `calibrating`, and has processed nothing yet.
+    """
+
+    def __init__(self, odometry: Odometry) -> None:
+        self._odometry = odometry
+        self._windows: list[FullWindow] = []
+        odometry.on_full_window(self._windows.append)
+
+    def calibrate(
+        self, what: str, end_ns: int, on_progress: Progress = lambda *_: None, compares_halves: bool = True
+    ) -> RecordedCalibration:
+        """Calibrate the rig when the odometry has finished.
+
+        Args:
+            what: one of `GROUPS`.
+            end_ns: stamp of the last frameset.
+            on_progress: follows the work.
+            compares_halves: whether the two halves of the recording are calibrated by themselves as well.
+
+        Raises:
+            CalibrationError: if the rig hardly moved, or its calibration changed.
+        """
+        rig, windows = self._odometry.rig, self._windows
+        if len(windows) < _MIN_WINDOWS:
+            raise CalibrationError(
+                f"the images hardly move, or are not tracked: {len(windows)} windows of keyframes, and at least "
+                f"{_MIN_WINDOWS} are wanted; walk for half a minute with turns, near textured surfaces"
+            )
+        prior_rig = _with_fixed(rig, _FIXED[what])
+        online = self._odometry.calibration
+        assert online is not None, "the configuration asks for it"
+        judged = end_ns, online.is_file_exact, self._odometry.calibration_findings, self._odometry.clock_shift_s
+        mean = online.posterior.mean
+        batch = calibrate_windows(prior_rig, windows, mean, lambda k, n: on_progress("all windows", k, n))
+        if sum(batch.left_out) > len(windows) // 2:
+            raise CalibrationError(
+                f"{sum(batch.left_out)} of {len(windows)} windows contradict the others, or fit no calibration: did it "
+                "change on the way, or is what is kept as in the file wrong (--what all)?"
+            )
+        if len(windows) < _MIN_OF_HALVES or not compares_halves:
+            return RecordedCalibration(what, rig, batch, None, *judged)
+        middle, mean = len(windows) // 2, batch.estimate.posterior.mean
+        first = calibrate_windows(prior_rig, windows[:middle], mean, lambda k, n: on_progress("first half", k, n))
+        second = calibrate_windows(prior_rig, windows[middle:], mean, lambda k, n: on_progress("second half", k, n))
+        return RecordedCalibration(what, rig, batch, (first, second), *judged)
 
 
 def _with_fixed(rig: Rig, names: Sequence[str]) -> Rig:

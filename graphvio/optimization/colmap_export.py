@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from graphvio.arrays import Float
 from graphvio.config import Config
@@ -19,7 +19,7 @@ from graphvio.errors import OptimizationError, writing
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.covisibility import verify_matches
 from graphvio.optimization.loops.closures import Place
-from graphvio.optimization.loops.colmap_library import colmap
+from graphvio.optimization.loops.colmap_library import colmap, only_errors_logged
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.place_images import write_place
 from graphvio.optimization.loops.search import SessionInput
@@ -28,7 +28,7 @@ from graphvio.optimization.optimize import Optimization
 Progress = Callable[[str, int, int], None]
 """Called with the kind of item, the number of finished ones and of all."""
 
-_THREADS = 2
+_IMAGES = "images"
 _REFINEMENTS = 2  # COLMAP's default of 5 takes half as long again, and moves nothing by 0.001 px
 
 
@@ -63,17 +63,21 @@ def export(
         raise OptimizationError(
             f"{database.path}: holds no image of the sessions' places; extract their features first"
         )
-    with writing(folder, OptimizationError, "is the disk full?"):
-        _write_images(sessions, database, folder / "images", partial(on_progress, "images"))
+    with writing(folder, OptimizationError, "is the disk full?"), _ImageWriter(sessions, database, folder) as images:
         verify_matches(optimization, sessions, database, partial(on_progress, "matches"))
         for old in (folder / "sparse").glob("*"):
             if re.fullmatch(r"\d+", old.name):
                 shutil.rmtree(old)
+        models = []
         for number, places in enumerate(groups):
             target = folder / "sparse" / str(number)
             target.mkdir(parents=True)
-            _triangulated(_posed(optimization, sessions, places, database), database, folder, target, config)
+            model = _posed(optimization, sessions, places, database)
+            models.append(_triangulated(model, database, folder, target, config))
             on_progress("models", number + 1, len(groups))
+        images.wait(partial(on_progress, "images"))
+        for number, model in enumerate(models):
+            _write(model, folder / _IMAGES, folder / "sparse" / str(number))
 
 
 def _names(session: SessionInput, place: Place, database: FeatureDatabase) -> list[str]:
@@ -94,20 +98,37 @@ def _by_frame(
     return [groups[frame] for frame in sorted(groups, key=lambda frame: (-len(groups[frame]), frame))]
 
 
-def _write_images(
-    sessions: Sequence[SessionInput], database: FeatureDatabase, folder: Path, on_progress: Callable[[int, int], None]
-) -> None:
-    """Write the images of all places of which a file is missing."""
-    places = [(session, place) for session in sessions for place in session.places]
+class _ImageWriter:
+    """Writes the images of all places of which a file is missing, beside the triangulation, which has one thread."""
 
-    def write(of: tuple[SessionInput, Place]) -> None:
+    def __init__(self, sessions: Sequence[SessionInput], database: FeatureDatabase, folder: Path) -> None:
+        self._folder = folder / _IMAGES
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="graphvio-images")
+        places = [(session, place) for session in sessions for place in session.places]
+        names = [_names(session, place, database) for session, place in places]  # the database is for this thread
+        self._writing = [self._pool.submit(self._write, *each) for each in zip(places, names, strict=True)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def wait(self, on_progress: Callable[[int, int], None]) -> None:
+        """Wait until all are written.
+
+        Raises:
+            SourceError: if an image cannot be read.
+        """
+        for done, each in enumerate(self._writing, start=1):
+            each.result()
+            on_progress(done, len(self._writing))
+
+    def _write(self, of: tuple[SessionInput, Place], names: Sequence[str]) -> None:
         session, place = of
-        if not all((folder / name).exists() for name in _names(session, place, database)):
-            write_place(folder, session.rig, session.name, session.source.frameset_at(place.stamp_ns))
-
-    with ThreadPoolExecutor(_THREADS, thread_name_prefix="graphvio-images") as pool:
-        for done, _ in enumerate(pool.map(write, places), start=1):
-            on_progress(done, len(places))
+        if not all((self._folder / name).exists() for name in names):
+            write_place(self._folder, session.rig, session.name, session.source.frameset_at(place.stamp_ns))
 
 
 def _posed(
@@ -123,8 +144,8 @@ def _posed(
     return database.model(rigs)
 
 
-def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: Path, config: Config) -> None:
-    """Triangulate the database's verified matches and write the model, with poses and cameras held fixed."""
+def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: Path, config: Config) -> Any:
+    """Triangulate the database's verified matches, with poses and cameras held fixed; points have no colours yet."""
     library = colmap()
     options = library.IncrementalPipelineOptions()
     options.num_threads = 1  # with more, points depend on their timing
@@ -137,8 +158,18 @@ def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: P
     options.constant_cameras = set(model.cameras)
     options.triangulation.ignore_two_view_tracks = False  # two views of a calibrated stereo pair suffice
     try:
-        triangulated = library.triangulate_points(model, database.path, folder / "images", target, True, options)
+        with only_errors_logged():  # not that images are missing, which are being written
+            triangulated = library.triangulate_points(model, database.path, folder / _IMAGES, target, True, options)
         triangulated.update_point_3d_errors()
-        triangulated.write(target)
     except (RuntimeError, ValueError) as error:
         raise OptimizationError(f"{target}: COLMAP cannot triangulate the places' features ({error})") from None
+    return triangulated
+
+
+def _write(model: Any, images: Path, target: Path) -> None:
+    """Colour a model's points by the images, and write it."""
+    try:
+        model.extract_colors_for_all_images(images)
+        model.write(target)
+    except (RuntimeError, ValueError) as error:
+        raise OptimizationError(f"{target}: COLMAP cannot write the model ({error})") from None

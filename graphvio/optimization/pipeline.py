@@ -3,31 +3,31 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
-from graphvio.errors import TrajectoryError
+from graphvio.errors import CalibrationError, TrajectoryError
+from graphvio.odometry import Odometry
+from graphvio.odometry.recorded_calibration import CalibrationWindows, calibrating
 from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, model_points, ply, trajectory_text, write_g2o
 from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
 from graphvio.optimization.loops.database import FeatureDatabase, colmap_model
-from graphvio.optimization.loops.features import extract_places
+from graphvio.optimization.loops.features import extract_places, merge_places
 from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import SessionInput, find_loops
+from graphvio.optimization.measuring import measure
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.optimization.report.write import write_plan, write_report
-from graphvio.optimization.session_calibration import FINDINGS, calibrated_rig
+from graphvio.optimization.session_calibration import FINDINGS, calibrated_rig, cannot_be_calibrated
 from graphvio.optimization.workspace import Workspace, digest
-from graphvio.pipeline import RunListener, run
-from graphvio.results import ResultWriter
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig
 from graphvio.rig_files.native import to_text
@@ -38,6 +38,7 @@ from graphvio.version import __version__
 
 DATABASE = "database.db"
 _REFINED = "rig-refined.yaml"
+_AHEAD = "features-ahead.db"  # of a session, while its odometry runs
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage, how much of it is done, and how much there is."""
@@ -83,7 +84,7 @@ def optimize_sessions(
     with stages.locked():
         if stages.calibrates_first:
             for number in range(len(sessions)):
-                stages.calibrate(number)
+                stages.calibrate(number, with_features=with_loops)
         records = []
         for number in range(len(sessions)):
             records.append(stages.record(number, with_features=with_loops))
@@ -147,21 +148,43 @@ class Stages:
         """Keep other processes from continuing in the folder, see `Workspace.locked`."""
         return self._space.locked()
 
-    def calibrate(self, number: int) -> None:
-        """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays."""
+    def calibrate(self, number: int, *, with_features: bool = False) -> None:
+        """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays.
+
+        Where the recording says nothing against the rig file, this is the session's odometry as well, and `record`
+        has nothing left to do. With ``with_features``, so are the features of its places.
+        """
         session = self._sessions[number]
         stage, names = f"calibration of {session.name}", [f"{session.name}/{name}" for name in (_REFINED, FINDINGS)]
         if not self._space.has_finished(stage):
-            totals = {"odometry": session.source.frameset_count}
-            rig, sentences = calibrated_rig(
-                session.source,
-                self._config,
-                lambda part, done, total: self._on_progress(f"{stage}: {part}", done, totals.get(part, total)),
-            )
+            rig, sentences, record = self._calibrated(number, stage, with_features)
             self._space.write(names[0], to_text(rig, self._space.folder / session.name).encode())
             self._space.write(names[1], (json.dumps(sentences, indent=2) + "\n").encode())
-            self._space.finish(stage, *names)
+            self._space.finish(stage, *names, *([] if record is None else self._recorded_files(session)))
+            if record is not None and with_features:
+                self.features(number, record)
         self.use_calibrated(number)
+
+    def _calibrated(self, number: int, stage: str, with_features: bool) -> tuple[Rig, list[str], SessionRecord | None]:
+        """Return the calibrated rig, sentences on it, and the session's record if all was measured with this rig."""
+        session, rig = self._sessions[number], self._sessions[number].source.rig
+        try:
+            odometry = Odometry(rig, calibrating(self._config))
+        except CalibrationError as error:
+            return rig, [cannot_be_calibrated(error)], None
+        windows = CalibrationWindows(odometry)
+        recorder, ahead = Recorder(session.name), self._features_ahead(number) if with_features else None
+        is_as_given = self._measure(number, odometry, f"{stage}: odometry", recorder, ahead)
+
+        def on_progress(part: str, done: int, total: int) -> None:
+            self._on_progress(f"{stage}: {part}", done, total)
+
+        found, sentences = calibrated_rig(rig, windows, session.source.end_ns, on_progress)
+        if is_as_given and found is rig:
+            return rig, sentences, self._keep(number, recorder, ahead)
+        if ahead is not None:
+            ahead.database.unlink(missing_ok=True)
+        return found, sentences, None
 
     def use_calibrated(self, number: int) -> None:
         """Use the rig that `calibrate` has written, in this folder or in another one that it was copied from."""
@@ -173,33 +196,39 @@ class Stages:
         With ``with_features``, features of places are extracted at the same time, as far as they are known until then.
         """
         session = self._sessions[number]
-        name, stage = f"{session.name}/record.npz", f"odometry of {session.name}"
+        stage = _odometry_of(session)
         if not self._space.has_finished(stage):
-            folder = self._space.folder / session.name / "odometry"
-            shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
-            recorder = Recorder(session.name)
-            listener = RunListener(
-                on_step=recorder.add,
-                on_smoothed=recorder.add_smoothed,
-                on_views=recorder.add_views,
-                on_progress=lambda progress: self._on_progress(stage, progress.framesets, progress.total),
-            )
             # All motions of a session must be measured with one calibration.
             config = replace(self._config, calibration=CalibrationConfig(online=False))
-            ahead = self._features_ahead(number) if with_features else None
-            listeners = [listener]
-            if ahead is not None:
-                listeners.append(RunListener(on_step=ahead.add, on_smoothed=ahead.add_smoothed))
-            with ResultWriter(folder, self._rigs[number], config.to_yaml()) as writer, ahead or nullcontext():
-                run(session.source, config, writer, listeners, self._rigs[number])
-            record = recorder.record()
-            if ahead is not None:
-                chosen = [place.stamp_ns for place in self.places(number, record).places]
-                if ahead.stamps_ns != chosen[: len(ahead.stamps_ns)]:  # a place that is none would stay in the map
-                    self._discard_features()
-            self._space.write(name, record.to_bytes())
-            self._space.finish(stage, name, f"{session.name}/odometry/summary.json")
-        return SessionRecord.load(self._space.folder / name)
+            recorder, ahead = Recorder(session.name), self._features_ahead(number) if with_features else None
+            self._measure(number, Odometry(self._rigs[number], config), stage, recorder, ahead)
+            self._keep(number, recorder, ahead)
+        return SessionRecord.load(self._space.folder / self._recorded_files(session)[0])
+
+    def _measure(
+        self, number: int, odometry: Odometry, stage: str, recorder: Recorder, ahead: FeaturesAhead | None
+    ) -> bool:
+        session = self._sessions[number]
+        folder = self._space.folder / session.name / "odometry"
+
+        def on_progress(done: int, total: int) -> None:
+            self._on_progress(stage, done, total)
+
+        return measure(session.source, odometry, recorder, folder, on_progress, ahead)
+
+    def _keep(self, number: int, recorder: Recorder, ahead: FeaturesAhead | None) -> SessionRecord:
+        """Write what was recorded of a session, and finish its odometry."""
+        session, record = self._sessions[number], recorder.record()
+        if ahead is not None:
+            self._keep_features(number, record, ahead)
+        files = self._recorded_files(session)
+        self._space.write(files[0], record.to_bytes())
+        self._space.finish(_odometry_of(session), *files)
+        return record
+
+    @staticmethod
+    def _recorded_files(session: Session) -> tuple[str, str]:
+        return f"{session.name}/record.npz", f"{session.name}/odometry/summary.json"
 
     def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
         """Find loop closures within and between the sessions."""
@@ -292,16 +321,27 @@ class Stages:
             )
         self._space.finish(stage, DATABASE)
 
-    def _discard_features(self) -> None:
-        self._space.forget("loops", *(_features_of(each.name) for each in self._sessions))
-        (self._space.folder / DATABASE).unlink()
-
     def _features_ahead(self, number: int) -> FeaturesAhead | None:
         session = self._sessions[number]
         if self._space.has_finished(_features_of(session.name)):
             return None
-        database = self._space.folder / DATABASE
+        (self._space.folder / session.name).mkdir(exist_ok=True)
+        database = self._space.folder / session.name / _AHEAD
         return FeaturesAhead(session.source, self._rigs[number], session.name, database, self._config)
+
+    def _keep_features(self, number: int, record: SessionRecord, ahead: FeaturesAhead) -> None:
+        """Copy the features that were extracted ahead to the database of all, unless a place has become none."""
+        session, chosen = self._sessions[number], [place.stamp_ns for place in self.places(number, record).places]
+        stamps_ns = ahead.stamps_ns
+        if stamps_ns and stamps_ns == chosen[: len(stamps_ns)]:
+            with FeatureDatabase(ahead.database) as part, FeatureDatabase(self._space.folder / DATABASE) as whole:
+                merge_places(part, whole, session.name, self._rigs[number], stamps_ns)
+        ahead.database.unlink(missing_ok=True)
+
+
+def _odometry_of(session: Session) -> str:
+    """Return the name of a stage."""
+    return f"odometry of {session.name}"
 
 
 def _features_of(name: str) -> str:

@@ -5,29 +5,38 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from graphvio.config import Config
 from graphvio.errors import CalibrationError
-from graphvio.odometry.recorded_calibration import Progress, calibrate_recording
+from graphvio.odometry.recorded_calibration import CalibrationWindows, Progress
 from graphvio.rig import Rig
 from graphvio.self_calibration.findings import described
-from graphvio.sources import Source
 
 FINDINGS = "calibration.json"
 """File of a session with what was found, a sentence each."""
 
 
-def calibrated_rig(source: Source, config: Config, on_progress: Progress) -> tuple[Rig, list[str]]:
-    """Calibrate the rig of a recording, and return it with sentences on what was found.
+def calibrated_rig(rig: Rig, windows: CalibrationWindows, end_ns: int, on_progress: Progress) -> tuple[Rig, list[str]]:
+    """Calibrate a rig from a recording, and return it with sentences on what was found.
 
     It stays where the recording says nothing against it, or does not show it.
+
+    Args:
+        rig: of the rig file.
+        windows: of an odometry that has finished.
+        end_ns: stamp of the recording's last frameset.
+        on_progress: follows the work.
     """
     try:
-        found = calibrate_recording(source, source.rig, "all", config, on_progress, compares_halves=False)
+        found = windows.calibrate("all", end_ns, on_progress, compares_halves=False)
     except CalibrationError as error:
-        return source.rig, [f"calibration: as in the rig file, since it cannot be estimated: {error}"]
+        return rig, [cannot_be_calibrated(error)]
     if found.is_file_exact and not found.clock_shift_s:
-        return source.rig, ["calibration: as in the rig file, which the recording does not contradict"]
+        return rig, ["calibration: as in the rig file, which the recording does not contradict"]
     return found.rig, [*described(found.findings), *found.remarks]
+
+
+def cannot_be_calibrated(error: CalibrationError) -> str:
+    """Return a sentence on a rig that stays as it is."""
+    return f"calibration: as in the rig file, since it cannot be estimated: {error}"
 
 
 def session_findings(folder: Path) -> list[str]:

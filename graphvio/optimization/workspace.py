@@ -78,12 +78,6 @@ class Workspace:
         self._finished[stage] = list(files)
         self._save()
 
-    def forget(self, *stages: str) -> None:
-        """Let stages be done once more."""
-        for stage in stages:
-            self._finished.pop(stage, None)
-        self._save()
-
     def write(self, name: str, data: bytes) -> None:
         """Write a file, which is whole or absent."""
         path = self.folder / name

@@ -29,6 +29,7 @@ class FeaturesAhead:
 
     Attributes:
         stamps_ns: of the places whose features are in the database, in order; complete at the end.
+        database: its path; the file is made at the start.
     """
 
     def __init__(self, source: Source, rig: Rig, session: str, database: Path, config: Config) -> None:
@@ -37,7 +38,7 @@ class FeaturesAhead:
         self._source = source
         self._rig = rig
         self._session = session
-        self._database = database
+        self.database = database
         self._config = config
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)
         self._epochs: dict[int, int] = {}  # of framesets whose final pose is awaited, in order
@@ -52,9 +53,13 @@ class FeaturesAhead:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.stop()
+        self._thread.join()
+
+    def stop(self) -> None:
+        """Extract no features of more places than the one at work."""
         self._is_stopped = True
         self._chosen.put(None)
-        self._thread.join()
 
     def add(self, step: Step) -> None:
         """Add a step of the odometry."""
@@ -74,7 +79,7 @@ class FeaturesAhead:
     def _work(self) -> None:
         try:
             with (
-                FeatureDatabase(self._database) as database,
+                FeatureDatabase(self.database) as database,
                 PlaceObserver(self._rig, self._config, in_processes=True) as observer,
             ):
                 while (stamp_ns := self._chosen.get()) is not None and not self._is_stopped:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from graphvio.errors import OptimizationError, importing
@@ -28,3 +30,15 @@ def colmap() -> Any:
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     return pycolmap
+
+
+@contextmanager
+def only_errors_logged() -> Iterator[None]:
+    """Keep COLMAP from logging warnings meanwhile."""
+    logging = colmap().logging
+    before = logging.minloglevel
+    logging.minloglevel = logging.Level.ERROR.value
+    try:
+        yield
+    finally:
+        logging.minloglevel = before

@@ -1,0 +1,63 @@
+"""A session's odometry with its results in files, whose measurements are recorded for the graph."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+from graphvio.odometry import Odometry
+from graphvio.optimization.loops.ahead import FeaturesAhead
+from graphvio.optimization.record import Recorder
+from graphvio.pipeline import RunListener, run
+from graphvio.results import ResultWriter
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.sources import Source
+
+
+def measure(
+    source: Source,
+    odometry: Odometry,
+    recorder: Recorder,
+    folder: Path,
+    on_progress: Callable[[int, int], None],
+    ahead: FeaturesAhead | None = None,
+) -> bool:
+    """Run an odometry on a session.
+
+    Args:
+        source: of the session.
+        odometry: that has processed nothing yet.
+        recorder: gets what it measures.
+        folder: of the odometry's results; those of an interrupted run are removed.
+        on_progress: called with the number of estimated framesets and of all.
+        ahead: extracts features of places at the same time, as far as they are known until then. It stops where the
+            calibration is corrected: features are matched in stereo by one calibration.
+
+    Returns:
+        Whether all was measured with the calibration and the clocks that the odometry was given.
+    """
+    is_as_given = True
+
+    def note_calibration(_: int, estimate: CalibrationEstimate) -> None:
+        nonlocal is_as_given
+        is_as_given &= estimate.is_file_exact
+        if ahead is not None and not is_as_given:
+            ahead.stop()
+
+    listeners = [
+        RunListener(
+            on_step=recorder.add,
+            on_smoothed=recorder.add_smoothed,
+            on_views=recorder.add_views,
+            on_calibration=note_calibration,
+            on_progress=lambda progress: on_progress(progress.framesets, progress.total),
+        )
+    ]
+    if ahead is not None:
+        listeners.append(RunListener(on_step=ahead.add, on_smoothed=ahead.add_smoothed))
+    shutil.rmtree(folder, ignore_errors=True)
+    with ResultWriter(folder, odometry.rig, odometry.config.to_yaml()) as writer, ahead or nullcontext():
+        run(source, odometry, writer, listeners)
+    return is_as_given and not odometry.rig_warnings
