@@ -92,6 +92,7 @@ def run(
     bias_error: Float | None = None,
     with_imu: bool = True,
     turn_rad: float = 0.5,
+    quality: Quality = Quality.GOOD,
 ) -> Outcome:
     """Vision has these errors, one sigma, or sees nothing; the gyro's bias may be thought to be known, and be wrong."""
     rng, rig, config = np.random.default_rng(seed), default_rig(), Config()
@@ -127,9 +128,7 @@ def run(
             if sigmas is not None:
                 measured = np.linalg.inv(true_before) @ true @ se3_exp(sigmas * rng.standard_normal(6))
                 motion = RelativeMotion(before_ns, stamp_ns, measured, np.diag(sigmas**2), np.zeros((6, 6)), 200)
-                used = (
-                    estimator.apply(VisualResult(motion, Quality.GOOD, "", {}), is_stationary=False).motion is not None
-                )
+                used = estimator.apply(VisualResult(motion, quality, "", {}), is_stationary=False).motion is not None
         out.status.append(estimator.update(stamp_ns, used, frozenset()).status)
         state, covariance = estimator.state(), estimator.covariance
         rotation = state.nav_T_body[:3, :3]
@@ -221,13 +220,17 @@ def test_initialisation_that_lacks_something_is_reported_once() -> None:
     assert "velocity" in detail
 
 
-def test_steady_course_that_the_imu_takes_for_a_standstill_is_known_after_some_motions() -> None:
+@pytest.mark.parametrize(("quality", "refused"), [(Quality.GOOD, 0), (Quality.WEAK, 2)])
+def test_steady_course_that_the_imu_takes_for_a_standstill_is_known_after_some_motions(
+    quality: Quality, refused: int
+) -> None:
+    """A good motion is believed at once; weak ones may be wrong."""
     for seed in range(4):
-        out = run(seed, 0.0, 0.5, duration_s=2.0, turn_rad=0.0)
-        assert out.speed_m_s[0] > 0.5
-        assert max(out.speed_m_s[6:]) < 0.1
+        out = run(seed, 0.0, 0.5, duration_s=2.0, turn_rad=0.0, quality=quality)
+        assert min(out.speed_m_s[: refused + 1]) > 0.5
+        assert max(out.speed_m_s[refused + 1 :]) < 0.2
         assert [kind for _, kind, _ in out.events].count("gate_reset") == 1
-        assert max(out.step_m[6:]) < 0.01
+        assert max(out.step_m[refused + 2 :]) < 0.01
 
 
 def test_what_is_wrong_and_taken_for_known_is_given_up() -> None:

@@ -26,6 +26,7 @@ from graphvio.backend.initial_state import (
     with_uncertain_position,
     with_wide_attitude,
 )
+from graphvio.backend.refused_motions import RefusedMotions
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StateCovariance
 from graphvio.backend.status import StatusMonitor, missing_of
@@ -41,7 +42,7 @@ from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
 _MAX_MOTIONS_OF_A_STANDSTILL = 20  # then a standstill that was assumed is believed
-_MIN_AGAINST_STANDSTILL = 3  # rejected motions, soon after an initialisation at a standstill
+_MIN_WEAK_AGAINST_STANDSTILL = 3  # refused motions, soon after an initialisation at a standstill; of good ones, one
 _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
 _MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
@@ -73,10 +74,7 @@ class SmootherEstimator:
         self._reset_ns = 0
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._accepted = 0  # motions since the initialisation
-        self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
-        self._is_chain_after_gap = False  # whether these begin at a state that the IMU alone has led to
-        self._imu_failed = False  # samples were missing after the first rejected motion
-        self._is_distrusted = False  # calibration of the IMU or initial state proved to be wrong
+        self._refused = RefusedMotions()
         self._are_points_wrong = False  # the few ones of partial motions, since the last good motion
         self._is_predicted_by_imu = False  # the newest state
         self._is_imu_left_out = False
@@ -167,7 +165,8 @@ class SmootherEstimator:
         if interval is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
             self._reinitialise_after_gap(stamp_ns)
             return True
-        self._imu_failed |= self.has_imu and interval is None and bool(self._refused)
+        if self.has_imu and interval is None:
+            self._refused.note_missing_imu()
         self._is_predicted_by_imu = self.has_imu and interval is not None
         before = self.state()
         try:
@@ -224,7 +223,7 @@ class SmootherEstimator:
 
     def pose_by_vision(self) -> Float:
         """Return ``nav_T_body`` (4, 4) of the newest state, by motions where they have been refused until then."""
-        return self._refused.get(self.latest_ns, self.state().nav_T_body)
+        return self._refused.nav_T_body.get(self.latest_ns, self.state().nav_T_body)
 
     def distrust_prediction(self) -> None:
         """Mark the prediction as wrong, after an error of the IMU's calibration, if motions are being refused.
@@ -232,7 +231,7 @@ class SmootherEstimator:
         The next motion of good quality then resets the state. Unlike when motions are refused for too long, biases and
         attitude become uncertain, as they have followed wrong samples.
         """
-        self._is_distrusted = bool(self._refused)
+        self._refused.distrust_prediction()
 
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
         """Use the IMU again after it was left out: keep the newest pose, and reset velocity, biases and gravity.
@@ -338,7 +337,7 @@ class SmootherEstimator:
         if visual.quality is not Quality.GOOD and not self._may_be_moving:
             # Vision that contradicts itself cannot refute the prediction, but for a standstill that is only assumed.
             return MeasurementUpdate(None)
-        return self._refuse(motion)
+        return self._refuse(motion, visual.quality)
 
     def _apply_partial_motion(self, motion: RelativeMotion | None) -> MeasurementUpdate:
         """Let few points correct the state that the IMU predicts, if they pass the gate; vision fails all the same.
@@ -361,44 +360,36 @@ class SmootherEstimator:
 
     def _accept(self, motion: RelativeMotion) -> MeasurementUpdate:
         """Insert a motion that passes the gate; reinitialise if it begins at a state whose own motion was refused."""
-        if motion.reference_stamp_ns not in self._refused:
+        if motion.reference_stamp_ns not in self._refused.nav_T_body:
             self._running.add_motion(motion)
             self._accepted += 1
             self._note_accepted()
             return MeasurementUpdate(motion)
         # It agrees with the prediction only because both start from a state that vision did not constrain.
-        self._add_refused(motion)
-        if self._is_distrusted or self._imu_failed:
+        self._refused.add(motion, self._running.pose, self._tracked_ns)
+        if self._refused.is_distrusted or self._refused.has_imu_failed:
             self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
         else:
             self._reinitialise_from_prediction(motion)
         return MeasurementUpdate(motion, needs_keyframe=True)
 
-    def _refuse(self, motion: RelativeMotion) -> MeasurementUpdate:
+    def _refuse(self, motion: RelativeMotion, quality: Quality) -> MeasurementUpdate:
         """Leave a motion out, or reinitialise from vision where the prediction has proved to be wrong."""
-        self._add_refused(motion)
-        if self._may_be_moving and len(self._refused) >= _MIN_AGAINST_STANDSTILL:
-            self._is_distrusted, why = True, "it was initialised in a steady motion, as at a standstill"
-        elif self._gap_s > _MIN_GAP_S and not self._may_be_moving and len(self._refused) >= _MIN_AFTER_GAP:
-            self._is_distrusted, why = True, f"refused after {self._gap_s:.1f} s that the IMU alone has bridged"
-        elif self._is_distrusted:
+        refused = self._refused
+        refused.add(motion, self._running.pose, self._tracked_ns)
+        is_against_standstill = quality is Quality.GOOD or len(refused) >= _MIN_WEAK_AGAINST_STANDSTILL
+        if self._may_be_moving and is_against_standstill:
+            refused.is_distrusted, why = True, "it was initialised in a steady motion, as at a standstill"
+        elif self._gap_s > _MIN_GAP_S and not self._may_be_moving and len(refused) >= _MIN_AFTER_GAP:
+            refused.is_distrusted, why = True, f"refused after {self._gap_s:.1f} s that the IMU alone has bridged"
+        elif refused.is_distrusted:
             why = "the IMU was corrected wrongly while vision was refused"
-        elif motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
+        elif motion.stamp_ns - refused.first_ns > self._config.smoother.max_gated_s * 1e9:
             why = "refused for too long"
         else:
             return MeasurementUpdate(None)
         self._reinitialise_from_vision(motion, why)
         return MeasurementUpdate(motion, needs_keyframe=True)
-
-    def _add_refused(self, motion: RelativeMotion) -> None:
-        """Record the pose that a refused motion leads to, from a state or from the pose that earlier ones led to."""
-        reference_ns = motion.reference_stamp_ns
-        if not self._refused:
-            self._is_chain_after_gap = reference_ns > self._tracked_ns
-        nav_T_reference = self._refused.get(reference_ns)
-        if nav_T_reference is None:
-            nav_T_reference = self._running.pose(reference_ns)
-        self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
 
     def _apply_zero_velocity(self) -> None:
         gate_result = self._running.gate_zero_velocity()
@@ -454,15 +445,15 @@ class SmootherEstimator:
         is known to have failed at that moment, or was corrected wrongly, the pose is uncertain by as much as it differs
         from the prediction.
         """
-        smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
-        predicted = smoother.state()
-        has_failed = self._is_distrusted or (self._imu_failed and not self._is_imu_left_out)
+        refused, nav_T_body = self._refused, self._refused.nav_T_body[motion.stamp_ns]
+        predicted = self._running.state()
+        has_failed = refused.is_distrusted or (refused.has_imu_failed and not self._is_imu_left_out)
         initial = from_vision(
             motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity, has_failed
         )
-        if self._is_distrusted:
+        if refused.is_distrusted:
             initial = with_wide_attitude(initial)
-        if self._gap_s > _MIN_GAP_S and self._is_chain_after_gap:
+        if self._gap_s > _MIN_GAP_S and refused.is_after_gap:
             # The velocity was wrong by more and more: the way through the gap is off by its mean.
             off_m_s = float(np.linalg.norm(initial.state.velocity_nav - predicted.velocity_nav))
             initial = with_uncertain_position(initial, 0.5 * off_m_s * self._gap_s)
@@ -479,8 +470,7 @@ class SmootherEstimator:
 
         Whether vision was wrong until then, or the IMU, is not known: the pose is uncertain by their difference.
         """
-        smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
-        predicted = smoother.state()
+        nav_T_body, predicted = self._refused.nav_T_body[motion.stamp_ns], self._running.state()
         initial = from_prediction(motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity)
         self._reinitialise(initial, self._tracked_ns)
         apart = se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)
@@ -510,7 +500,6 @@ class SmootherEstimator:
     def _note_accepted(self) -> None:
         """Record that vision is accepted: nothing is refused any more, and the estimate is not lost."""
         self._refused.clear()
-        self._imu_failed = self._is_distrusted = False
         self._status.is_lost = False
 
     @property
@@ -518,7 +507,7 @@ class SmootherEstimator:
         """Time over which the IMU alone had measured the motion when vision was first refused, seconds."""
         if not self.has_imu or self._is_imu_left_out or not self._refused:
             return 0.0
-        return 1e-9 * (min(self._refused) - self._tracked_ns)
+        return 1e-9 * (self._refused.first_ns - self._tracked_ns)
 
     @property
     def _may_be_moving(self) -> bool:
