@@ -57,6 +57,7 @@ from graphvio.monocular.window_prior import Prior, add_prior, first_prior
 from graphvio.monocular.window_solver import WindowSolver
 from graphvio.rig import Camera, Rig, SingleCamera
 from graphvio.rig_files.grouping import grouped_rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.inertial import InertialSamples
@@ -1236,6 +1237,22 @@ def test_estimator_is_lost_once_the_imu_has_been_silent_for_5_s() -> None:
     assert flown.estimator.epoch == 1
     before = flown.stamps_s[flown.stamps_s < 8.0]
     assert before[-1] == pytest.approx(6.95)
+
+
+@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (5, 1.7)])
+def test_estimator_loses_the_pose_if_an_imu_fails_as_no_calibration_is_off(axis: int, factor: float) -> None:
+    class Failing(Flight):
+        def reading(self, t: float) -> Float:
+            reading = super().reading(t)
+            reading[axis] *= factor if t > 4.0 else 1.0
+            return reading
+
+    known: list[CalibrationEstimate | None] = []
+    flown = fly(Failing(*moving()), 6.0, on_keyframe=lambda _, estimator, __: known.append(estimator.calibration))
+    assert (EventKind.LOST, "images and IMU contradict each other, whatever the calibration") in flown.events
+    assert flown.stamps_s[-1] < 5.0
+    for each in known:
+        assert each is None or each.rig.imu is not None  # or it raises: no rig is so wrong
 
 
 def test_gap_before_the_scale_is_known_delays_it() -> None:

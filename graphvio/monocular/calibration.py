@@ -115,9 +115,12 @@ class WindowCalibration:
         return self._files[key]
 
     def is_plausible(self, difference: Float) -> bool:
-        """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any."""
+        """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any.
+
+        An empty one, of a calibration that is not estimated, is.
+        """
         sigmas = MAX_FACTOR * np.sqrt(np.diag(self._prior.covariance))
-        return bool((np.abs(difference) <= _MAX_SIGMAS * sigmas).all())
+        return not len(difference) or bool((np.abs(difference) <= _MAX_SIGMAS * sigmas).all())
 
     def walk(self, seconds: float) -> Float:
         """Return the lower Cholesky factor (6 + F, 6 + F) of what biases and calibration change in some time.

@@ -307,6 +307,9 @@ class MonocularEstimator:
 
     def _judge(self, stamp_ns: int, solution: Solution) -> Status:
         """Return the status by a solution; end the epoch where images and IMU contradict each other for long."""
+        if not solution.is_plausible:
+            self._lose(stamp_ns, "images and IMU contradict each other, whatever the calibration")
+            return Status.LOST
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(self.covariance.pose[3:, 3:])[-1]))
         errors2 = solution.imu_errors2
         contradicts = bool(len(errors2) and not errors2[-1] < _MAX_IMU_ERROR2)
