@@ -13,6 +13,7 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.frontend.imaging.images import ImageMask
+from graphvio.frontend.lookalikes import without_lookalikes
 from graphvio.frontend.motion.depth_errors import by_depth_errors
 from graphvio.frontend.motion.depth_scale import is_of_singles, with_free_length
 from graphvio.frontend.motion.few_points import FewPoints, fit_few_points
@@ -142,6 +143,8 @@ class VisualFrontend(TrackingFrontend):
             agreement = agree(arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt)
             if agreement.contradicts:
                 self._contradicted_ns = seen.stamp_ns
+            if len(agreement.hypotheses) > 1:
+                agreement = without_lookalikes(agreement, seen, self._trackers, arrays.body_T_left)
         else:
             refined = best_pair_motion(arrays, observations, start, config, rng)
             agreement = Agreement((MotionHypothesis(observations.pairs, refined),), {})

@@ -7,7 +7,13 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.frontend.depth.matching import TwoCameras
 from graphvio.frontend.depth.motion_slants import MotionSlants, hand_on_slants
-from graphvio.frontend.depth.prediction import around, inverse_depths_around, patch_deviation_px, predict_warps
+from graphvio.frontend.depth.prediction import (
+    around,
+    inverse_depths_around,
+    patch_deviation_px,
+    predict_pixels,
+    predict_warps,
+)
 from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
 from graphvio.frontend.imaging.lucas_kanade import register
 from graphvio.frontend.imaging.sampling import PixelWords, pixel_words
@@ -15,6 +21,8 @@ from graphvio.rig import CameraGroup, SingleCamera
 
 _MAX_REGISTRATION_PX = 2.0
 _SAME_PATCH = 0.8  # correlation of the patches
+_MAX_OFF_PX = 1.0  # of a patch where a motion has it
+_MIN_APART_PX = 4.0  # places that are not the same
 
 
 class KeyframePatches:
@@ -133,9 +141,48 @@ class KeyframePatches:
         Returns:
             Pixels (N, 2), equal to the guess where there is no patch or it is not found, and which were found (N,).
         """
+        pixels, found, rows = self._registered(ids, guess, image, left_T_left_keyframe, min_gradient)
+        if self._slants is not None and found.any():
+            self._slants.measure(
+                self._group.left, self._frame, rows[found], pixels[found], image, left_T_left_keyframe, self._rays,
+                self._inverse_depths,
+            )  # fmt: skip
+        return pixels, found
+
+    def are_also_at(
+        self, keyframe_ns: int, ids: Int, pixels: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
+    ) -> Bool:
+        """Return which tracks (N,) were followed elsewhere than where a motion has them, and are seen there, too.
+
+        Args:
+            keyframe_ns: stamp of the keyframe; of another one there are no patches.
+            ids: (N,) the tracks.
+            pixels: (N, 2) to which they were followed.
+            image: (height, width), left.
+            left_T_left_keyframe: (4, 4) motion of points since the keyframe.
+            min_gradient: as for `find`.
+        """
+        frame, camera = self._frame, self._group.left
+        if frame.stamp_ns != keyframe_ns or not len(frame.ids):
+            return np.zeros(len(ids), dtype=bool)
+        rows = np.minimum(np.searchsorted(frame.ids, ids), len(frame.ids) - 1)
+        depths = np.maximum(frame.points[rows, 2], 0.0)
+        expected, _, is_in_view = predict_pixels(
+            frame.left_rays[rows], depths, left_T_left_keyframe, camera.model_number, camera.intrinsics,
+            camera.distortion,
+        )  # fmt: skip
+        found_px, found, _ = self._registered(ids, expected, image, left_T_left_keyframe, min_gradient)
+        is_there: Bool = np.linalg.norm(found_px - expected, axis=1) < _MAX_OFF_PX
+        is_elsewhere: Bool = np.linalg.norm(found_px - pixels, axis=1) > _MIN_APART_PX
+        return found & is_in_view & is_there & is_elsewhere
+
+    def _registered(
+        self, ids: Int, guess: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
+    ) -> tuple[Float, Bool, Int]:
+        """Return pixels and which tracks were found, as `find`, and their rows (N,) in the keyframe."""
         frame = self._frame
         if self._image is None or not len(frame.ids) or not len(ids):
-            return guess.copy(), np.zeros(len(ids), dtype=bool)
+            return guess.copy(), np.zeros(len(ids), dtype=bool), np.zeros(len(ids), dtype=np.int64)
         rows = np.minimum(np.searchsorted(frame.ids, ids), len(frame.ids) - 1)
         wanted = (frame.ids[rows] == ids) & frame.has_depth[rows]
         camera = self._group.left
@@ -163,8 +210,4 @@ class KeyframePatches:
         )
         found &= correlations > _SAME_PATCH
         pixels[~found] = guess[~found]
-        if self._slants is not None:
-            self._slants.measure(
-                camera, frame, rows[found], pixels[found], image, left_T_left_keyframe, self._rays, self._inverse_depths
-            )
-        return pixels, found
+        return pixels, found, rows

@@ -173,6 +173,22 @@ class GroupTracker:
         self._last = frame.extended(new)
         return self._last, which[new.ids - first_id]
 
+    def are_also_at(self, keyframe_ns: int, ids: Int, left_T_left_keyframe: Float) -> Bool:
+        """Return which tracks (N,) of the newest frame are seen where a motion since the keyframe has them, too.
+
+        Args:
+            keyframe_ns: stamp of the keyframe.
+            ids: (N,) the tracks, increasing.
+            left_T_left_keyframe: (4, 4) motion of points.
+        """
+        now, rows = common_rows(self._last.ids, ids)
+        found = np.zeros(len(ids), dtype=bool)
+        found[rows] = self._patches.are_also_at(
+            keyframe_ns, ids[rows], self._last.pixels[now], self._left_pyramid[0], left_T_left_keyframe,
+            self._min_gradient,
+        )  # fmt: skip
+        return found
+
     @property
     def tracked_image(self) -> TrackedImage:
         """The newest left image, and what is tracked in it."""
