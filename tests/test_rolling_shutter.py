@@ -13,6 +13,7 @@ from rendered import rendered_once
 from graphvio import Odometry, Rig, RigError, Trajectory, load_trajectory, open_source
 from graphvio.arrays import Float
 from graphvio.backend.readout_factor import readout_factor
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.evaluation import evaluate
 from graphvio.frontend.depth.stereo import triangulate
@@ -34,6 +35,7 @@ from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.inertial_state import InertialState
 from graphvio.measurements.motion import ByVelocities, RelativeMotion
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.monocular.equations import visual_equations
@@ -43,6 +45,7 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Camera, SingleCamera
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
+from graphvio.simulation.calibration_error import CalibrationErrorSizes, draw
 from graphvio.simulation.named_rigs import phone, stereo
 
 DURATION_S, READOUT_US = 5.0, 20e3
@@ -522,6 +525,24 @@ def test_first_framesets_in_motion_are_not_calibrated_by(fast_walk: Path, monkey
     assert all(known[stamp] for stamp in stamps[4:])
     assert calibrated
     assert not calibrated & {stamp for stamp, is_known in known.items() if not is_known}
+
+
+def test_window_of_compensated_views_does_not_replace_the_inertial_state(
+    fast_walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does with the same images of cameras whose lines are said to be exposed at once."""
+    replaced: list[InertialState] = []
+    monkeypatch.setattr(SmootherEstimator, "use_inertial_state", lambda _, known: replaced.append(known))
+    rig = open_source(fast_walk).rig
+    wrong = draw(rig, CalibrationErrorSizes.of_level(2, ["left-right-rotation"]), seed=1).written_rig
+    at_once = wrong.with_cameras(lambda camera: replace(camera, line_time_us=0.0))
+    for used, is_replaced in ((wrong, False), (at_once, True)):
+        replaced.clear()
+        odometry = Odometry(used)
+        for measurement in open_source(fast_walk, used):
+            odometry.process(measurement)
+        odometry.finish()
+        assert bool(replaced) == is_replaced
 
 
 def test_images_that_are_read_out_until_the_next_ones_are_as_accurate(fast_walk: Path) -> None:

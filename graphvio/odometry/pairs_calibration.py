@@ -196,10 +196,12 @@ class PairsCalibration:
     def _hand_over_inertial_state(self) -> None:
         """Let the estimator go on with what the window knows of velocity, biases and gravity.
 
-        The estimator has taken errors of the calibration for motion until now; to the window they are unknowns.
+        The estimator has taken errors of the calibration for motion until now; to the window they are unknowns. But it
+        takes views by rolling shutters for those of global ones, as they were compensated: in a turn, an error of the
+        IMU's clock, which is in that compensation, then looks like one of gravity and biases.
         """
         known, tolerant = self._calibration.inertial_state, self._imu_fault_tolerant
-        if known is None or tolerant is None:
+        if known is None or tolerant is None or any(camera.line_time_us for camera in self._rig.cameras):
             return
         stamp_ns, force = self._synchroniser.stamp_ns(known.stamp_ns), -known.gravity
         bias = known.accel_bias + self._synchroniser.imu_correction.applied_force(force) - force
