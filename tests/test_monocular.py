@@ -1239,20 +1239,37 @@ def test_estimator_is_lost_once_the_imu_has_been_silent_for_5_s() -> None:
     assert before[-1] == pytest.approx(6.95)
 
 
-@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (5, 1.7)])
-def test_estimator_loses_the_pose_if_an_imu_fails_as_no_calibration_is_off(axis: int, factor: float) -> None:
+def failing(axis: int, factor: float, until_s: float) -> Flight:
+    """The motion, with an axis of the IMU that is wrong by a factor after 4 s."""
+
     class Failing(Flight):
         def reading(self, t: float) -> Float:
             reading = super().reading(t)
-            reading[axis] *= factor if t > 4.0 else 1.0
+            reading[axis] *= factor if 4.0 < t < until_s else 1.0
             return reading
 
+    return Failing(*moving())
+
+
+@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (5, 1.7)])
+def test_estimator_loses_the_pose_if_an_imu_fails_as_no_calibration_is_off(axis: int, factor: float) -> None:
     known: list[CalibrationEstimate | None] = []
-    flown = fly(Failing(*moving()), 6.0, on_keyframe=lambda _, estimator, __: known.append(estimator.calibration))
+    flown = fly(
+        failing(axis, factor, 9.0), 6.0, on_keyframe=lambda _, estimator, __: known.append(estimator.calibration)
+    )
     assert (EventKind.LOST, "images and IMU contradict each other, whatever the calibration") in flown.events
     assert flown.stamps_s[-1] < 5.0
     for each in known:
         assert each is None or each.rig.imu is not None  # or it raises: no rig is so wrong
+
+
+@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (3, 0.4)])
+def test_estimator_learns_nothing_of_the_calibration_while_an_imu_fails(axis: int, factor: float) -> None:
+    flown = fly(failing(axis, factor, 4.6), 8.0)
+    assert flown.statuses[-1] is Status.TRACKING
+    assert flown.estimator.epoch == 1
+    assert flown.estimator._calibration.is_file_exact
+    assert abs(flown.estimator._samples.time_offset_s) < 1e-4
 
 
 def test_gap_before_the_scale_is_known_delays_it() -> None:

@@ -240,11 +240,17 @@ def test_record_with_features_extracts_first_places(walk: Path, settings: Path, 
     source, config = open_source(walk, to_s=3.0), Config.load(settings)
     stages = Stages([Session("walk", source)], tmp_path / "out", config)
     record = stages.record(0, with_features=True)
-    with FeatureDatabase(tmp_path / "out" / DATABASE) as database:
+    ahead = tmp_path / "out/walk/features-ahead.db"
+    with FeatureDatabase(ahead) as database:
         stored = {int(Path(name).stem) for name in database.names}
     chosen = [place.stamp_ns for place in stages.places(0, record).places]
     assert 0 < len(stored) <= len(chosen)
     assert stored == set(chosen[: len(stored)])
+    assert not (tmp_path / "out" / DATABASE).exists()  # to which sessions are added one after the other
+    stages.features(0, record)
+    assert not ahead.exists()
+    with FeatureDatabase(tmp_path / "out" / DATABASE) as database:
+        assert [int(Path(name).stem) for name in list(database._ids)[:: len(source.rig.cameras)]] == chosen
 
 
 def test_optimize_foreign_folder_is_refused_and_unchanged(
@@ -292,6 +298,10 @@ def test_calibrate_wrong_file_keeps_nothing_measured_with_it(walk: Path, tmp_pat
     used, refined = (load_rig(out / "walk" / name).pairs[0].right_T_left for name in ("odometry", "rig-refined.yaml"))
     np.testing.assert_allclose(used, refined, atol=1e-9)
     assert np.abs(used - wrong.pairs[0].right_T_left).max() > 1e-4
+    (out / "walk/calibration.json").unlink()
+    stages = Stages([Session("walk", open_source(walk, wrong, to_s=4.0))], out, Config())
+    stages.calibrate(0)  # writes over what the second pass has left
+    assert list(json.loads((out / "stages.json").read_text())["finished"]) == ["calibration of walk"]
 
 
 def test_optimize_exact_file_stays(short_walk: Path, done: Path) -> None:

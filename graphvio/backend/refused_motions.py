@@ -57,4 +57,4 @@ class RefusedMotions:
     def clear(self) -> None:
         """Forget all: a motion has passed the gate, or the state has been reinitialised."""
         self.nav_T_body.clear()
-        self.has_imu_failed = self.is_distrusted = False
+        self.is_after_gap = self.has_imu_failed = self.is_distrusted = False

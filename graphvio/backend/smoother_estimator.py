@@ -42,7 +42,7 @@ from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
 _MAX_MOTIONS_OF_A_STANDSTILL = 20  # then a standstill that was assumed is believed
-_MIN_WEAK_AGAINST_STANDSTILL = 3  # refused motions, soon after an initialisation at a standstill; of good ones, one
+_MIN_AGAINST_STANDSTILL = 3  # refused motions, soon after an initialisation at a standstill, if the first is weak
 _MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
 _MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
 _MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
@@ -377,11 +377,13 @@ class SmootherEstimator:
         """Leave a motion out, or reinitialise from vision where the prediction has proved to be wrong."""
         refused = self._refused
         refused.add(motion, self._running.pose, self._tracked_ns)
-        is_against_standstill = quality is Quality.GOOD or len(refused) >= _MIN_WEAK_AGAINST_STANDSTILL
-        if self._may_be_moving and is_against_standstill:
-            refused.is_distrusted, why = True, "it was initialised in a steady motion, as at a standstill"
+        is_first_good = quality is Quality.GOOD and self._accepted == 0  # no motion has agreed with a standstill
+        if self._may_be_moving and (is_first_good or len(refused) >= _MIN_AGAINST_STANDSTILL):
+            refused.distrust_prediction()
+            why = "it was initialised in a steady motion, as at a standstill"
         elif self._gap_s > _MIN_GAP_S and not self._may_be_moving and len(refused) >= _MIN_AFTER_GAP:
-            refused.is_distrusted, why = True, f"refused after {self._gap_s:.1f} s that the IMU alone has bridged"
+            refused.distrust_prediction()
+            why = f"refused after {self._gap_s:.1f} s that the IMU alone has bridged"
         elif refused.is_distrusted:
             why = "the IMU was corrected wrongly while vision was refused"
         elif motion.stamp_ns - refused.first_ns > self._config.smoother.max_gated_s * 1e9:

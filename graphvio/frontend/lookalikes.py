@@ -21,7 +21,9 @@ from graphvio.geometry import se3_inverse
 def without_lookalikes(
     agreement: Agreement, seen: TrackedFrameset, trackers: Sequence[GroupTracker], body_T_left: Float
 ) -> Agreement:
-    """Leave out the hypotheses whose points are where the first one has them, too, if the opposite is not true.
+    """Leave out the hypotheses whose points are where the first one has them, too.
+
+    Unless its own points are also where they have them: then nothing tells which is right.
 
     Args:
         agreement: of the frameset's motion.

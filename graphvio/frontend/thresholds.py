@@ -27,7 +27,7 @@ class AgreementThresholds:
         min_unexplained_share: Share of all points that are unexplained, from which on a second motion is looked for.
         min_rival_share: Share of these that it has to explain.
         min_comparable_support: Support, as a share of the best, from which on support alone does not decide.
-        min_lookalike_share: Share of a motion's points that are where another has them, too, from which on it is none.
+        min_lookalike_share: Share of points that are where another motion has them, too, of a motion that is none.
     """
 
     max_distance: float = 40.0

@@ -148,6 +148,10 @@ class WindowCalibration:
         self._kept = self._evidence
         self._files.clear()
 
+    def discard(self) -> None:
+        """Forget what the epoch that ends has shown."""
+        self.factors, self._evidence = self._first_factors, self._kept
+
     def forget(self) -> None:
         """Forget what ended epochs have shown: no motion fits it."""
         self._kept = Evidence.none(len(self._rows))

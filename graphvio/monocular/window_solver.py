@@ -48,7 +48,7 @@ class Solution(NamedTuple):
         imu_errors2: squared whitened errors of the IMU between the states.
         is_tracking: whether enough landmarks constrain the newest state.
         dropped: index of the camera -> tracks that do not stand still.
-        is_plausible: whether the calibration is such as sensors have.
+        is_plausible: whether the calibration is within what a rig file can be wrong by.
     """
 
     imu_errors2: Float
@@ -77,6 +77,7 @@ class WindowSolver:
         self.samples = samples
         self.covariance = NO_COVARIANCE
         self.first_pose_ns = 0
+        self._first_time_offset_s = 0.0
         self._cameras = cameras
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
@@ -109,6 +110,7 @@ class WindowSolver:
         """Begin with the window of an epoch's first pose, at a frameset."""
         self.first_pose_ns = stamp_ns
         self.calibration.begin(window.factors)
+        self._first_time_offset_s = self.samples.time_offset_s
 
     def solve(self, window: KeyframeWindow, stamp_ns: int, is_keyframe: bool) -> Solution:
         """Solve for the states and landmarks, and leave out what does not stand still.
@@ -154,6 +156,11 @@ class WindowSolver:
             structure, places, _ = self._structure(window)
             self._hand_over(structure, states, places)
         self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
+
+    def discard(self) -> None:
+        """Take back what an epoch's windows have shown of the calibration: none explains them."""
+        self.calibration.discard()
+        self.samples.time_offset_s = self._first_time_offset_s
 
     def forget(self) -> None:
         """Forget what the last window said of the newest state."""

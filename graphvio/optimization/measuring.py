@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from graphvio.odometry import Odometry
+from graphvio.odometry.step import Step
 from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.record import Recorder
 from graphvio.pipeline import RunListener, run
@@ -36,9 +37,14 @@ def measure(
             calibration is corrected: features are matched in stereo by one calibration.
 
     Returns:
-        Whether all was measured with the calibration and the clocks that the odometry was given.
+        Whether nothing was corrected on the way, and nothing speaks against the rig. After the end of an epoch it is
+        not known: single cameras may have corrected a calibration that they have not reported yet.
     """
     is_as_given = True
+
+    def note_step(step: Step) -> None:
+        nonlocal is_as_given
+        is_as_given &= step.estimate.epoch == 0
 
     def note_calibration(_: int, estimate: CalibrationEstimate) -> None:
         nonlocal is_as_given
@@ -49,11 +55,12 @@ def measure(
     listeners = [
         RunListener(
             on_step=recorder.add,
+            on_calibration=note_calibration,
             on_smoothed=recorder.add_smoothed,
             on_views=recorder.add_views,
-            on_calibration=note_calibration,
             on_progress=lambda progress: on_progress(progress.framesets, progress.total),
-        )
+        ),
+        RunListener(on_step=note_step),
     ]
     if ahead is not None:
         listeners.append(RunListener(on_step=ahead.add, on_smoothed=ahead.add_smoothed))

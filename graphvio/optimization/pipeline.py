@@ -19,7 +19,7 @@ from graphvio.optimization.exchange import covariance_text, frames_text, model_p
 from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
 from graphvio.optimization.loops.database import FeatureDatabase, colmap_model
-from graphvio.optimization.loops.features import extract_places, merge_places
+from graphvio.optimization.loops.features import extract_places, is_stored, merge_places
 from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import SessionInput, find_loops
 from graphvio.optimization.measuring import measure
@@ -152,26 +152,25 @@ class Stages:
         """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays.
 
         Where the recording says nothing against the rig file, this is the session's odometry as well, and `record`
-        has nothing left to do. With ``with_features``, so are the features of its places.
+        has nothing left to do.
         """
         session = self._sessions[number]
         stage, names = f"calibration of {session.name}", [f"{session.name}/{name}" for name in (_REFINED, FINDINGS)]
         if not self._space.has_finished(stage):
-            rig, sentences, record = self._calibrated(number, stage, with_features)
+            self._space.forget(_odometry_of(session))  # whose files are written over
+            rig, sentences, is_recorded = self._calibrated(number, stage, with_features)
             self._space.write(names[0], to_text(rig, self._space.folder / session.name).encode())
             self._space.write(names[1], (json.dumps(sentences, indent=2) + "\n").encode())
-            self._space.finish(stage, *names, *([] if record is None else self._recorded_files(session)))
-            if record is not None and with_features:
-                self.features(number, record)
+            self._space.finish(stage, *names, *(self._recorded_files(session) if is_recorded else ()))
         self.use_calibrated(number)
 
-    def _calibrated(self, number: int, stage: str, with_features: bool) -> tuple[Rig, list[str], SessionRecord | None]:
-        """Return the calibrated rig, sentences on it, and the session's record if all was measured with this rig."""
+    def _calibrated(self, number: int, stage: str, with_features: bool) -> tuple[Rig, list[str], bool]:
+        """Return the calibrated rig, sentences on it, and whether all was measured with it, and is recorded."""
         session, rig = self._sessions[number], self._sessions[number].source.rig
         try:
             odometry = Odometry(rig, calibrating(self._config))
         except CalibrationError as error:
-            return rig, [cannot_be_calibrated(error)], None
+            return rig, [cannot_be_calibrated(error)], False
         windows = CalibrationWindows(odometry)
         recorder, ahead = Recorder(session.name), self._features_ahead(number) if with_features else None
         is_as_given = self._measure(number, odometry, f"{stage}: odometry", recorder, ahead)
@@ -181,10 +180,10 @@ class Stages:
 
         found, sentences = calibrated_rig(rig, windows, session.source.end_ns, on_progress)
         if is_as_given and found is rig:
-            return rig, sentences, self._keep(number, recorder, ahead)
-        if ahead is not None:
-            ahead.database.unlink(missing_ok=True)
-        return found, sentences, None
+            self._keep(number, recorder)
+            return rig, sentences, True
+        self._features_ahead_of(session).unlink(missing_ok=True)  # by another rig
+        return found, sentences, False
 
     def use_calibrated(self, number: int) -> None:
         """Use the rig that `calibrate` has written, in this folder or in another one that it was copied from."""
@@ -202,7 +201,7 @@ class Stages:
             config = replace(self._config, calibration=CalibrationConfig(online=False))
             recorder, ahead = Recorder(session.name), self._features_ahead(number) if with_features else None
             self._measure(number, Odometry(self._rigs[number], config), stage, recorder, ahead)
-            self._keep(number, recorder, ahead)
+            self._keep(number, recorder)
         return SessionRecord.load(self._space.folder / self._recorded_files(session)[0])
 
     def _measure(
@@ -216,15 +215,12 @@ class Stages:
 
         return measure(session.source, odometry, recorder, folder, on_progress, ahead)
 
-    def _keep(self, number: int, recorder: Recorder, ahead: FeaturesAhead | None) -> SessionRecord:
+    def _keep(self, number: int, recorder: Recorder) -> None:
         """Write what was recorded of a session, and finish its odometry."""
-        session, record = self._sessions[number], recorder.record()
-        if ahead is not None:
-            self._keep_features(number, record, ahead)
+        session = self._sessions[number]
         files = self._recorded_files(session)
-        self._space.write(files[0], record.to_bytes())
+        self._space.write(files[0], recorder.record().to_bytes())
         self._space.finish(_odometry_of(session), *files)
-        return record
 
     @staticmethod
     def _recorded_files(session: Session) -> tuple[str, str]:
@@ -309,34 +305,43 @@ class Stages:
         stage, total = _features_of(session.name), len(session.places)
         if self._space.has_finished(stage):
             return
+        stamps_ns = [place.stamp_ns for place in session.places]
         with FeatureDatabase(self._space.folder / DATABASE) as database:
+            self._take_features_ahead(self._sessions[number], session.rig, stamps_ns, database)
             extract_places(
                 session.source,
                 session.rig,
                 session.name,
-                [place.stamp_ns for place in session.places],
+                stamps_ns,
                 database,
                 self._config,
                 lambda done: self._on_progress(stage, done, total),
             )
         self._space.finish(stage, DATABASE)
+        self._features_ahead_of(self._sessions[number]).unlink(missing_ok=True)
 
     def _features_ahead(self, number: int) -> FeaturesAhead | None:
         session = self._sessions[number]
         if self._space.has_finished(_features_of(session.name)):
             return None
-        (self._space.folder / session.name).mkdir(exist_ok=True)
-        database = self._space.folder / session.name / _AHEAD
+        database = self._features_ahead_of(session)
         return FeaturesAhead(session.source, self._rigs[number], session.name, database, self._config)
 
-    def _keep_features(self, number: int, record: SessionRecord, ahead: FeaturesAhead) -> None:
-        """Copy the features that were extracted ahead to the database of all, unless a place has become none."""
-        session, chosen = self._sessions[number], [place.stamp_ns for place in self.places(number, record).places]
-        stamps_ns = ahead.stamps_ns
-        if stamps_ns and stamps_ns == chosen[: len(stamps_ns)]:
-            with FeatureDatabase(ahead.database) as part, FeatureDatabase(self._space.folder / DATABASE) as whole:
-                merge_places(part, whole, session.name, self._rigs[number], stamps_ns)
-        ahead.database.unlink(missing_ok=True)
+    def _features_ahead_of(self, session: Session) -> Path:
+        """Return the path of the database of what is extracted while the session's odometry runs."""
+        return self._space.folder / session.name / _AHEAD
+
+    def _take_features_ahead(
+        self, session: Session, rig: Rig, stamps_ns: Sequence[int], whole: FeatureDatabase
+    ) -> None:
+        """Copy what was extracted of a session's first places, however many: rows are in the order of time then."""
+        path = self._features_ahead_of(session)
+        if not path.exists():
+            return
+        with FeatureDatabase(path) as part:
+            stored = [stamp_ns for stamp_ns in stamps_ns if is_stored(part, rig, session.name, stamp_ns)]
+            if stored == list(stamps_ns[: len(stored)]):
+                merge_places(part, whole, session.name, rig, stored)
 
 
 def _odometry_of(session: Session) -> str:

@@ -78,6 +78,11 @@ class Workspace:
         self._finished[stage] = list(files)
         self._save()
 
+    def forget(self, stage: str) -> None:
+        """Let a stage be done once more."""
+        if self._finished.pop(stage, None) is not None:
+            self._save()
+
     def write(self, name: str, data: bytes) -> None:
         """Write a file, which is whole or absent."""
         path = self.folder / name

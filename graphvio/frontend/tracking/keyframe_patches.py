@@ -21,8 +21,8 @@ from graphvio.rig import CameraGroup, SingleCamera
 
 _MAX_REGISTRATION_PX = 2.0
 _SAME_PATCH = 0.8  # correlation of the patches
-_MAX_OFF_PX = 1.0  # of a patch where a motion has it
-_MIN_APART_PX = 4.0  # places that are not the same
+_MAX_OFF_PX = 1.0  # distance of a patch from where a motion has it
+_MIN_APART_PX = 4.0  # distance of two places that are not the same
 
 
 class KeyframePatches:
@@ -166,10 +166,9 @@ class KeyframePatches:
         if frame.stamp_ns != keyframe_ns or not len(frame.ids):
             return np.zeros(len(ids), dtype=bool)
         rows = np.minimum(np.searchsorted(frame.ids, ids), len(frame.ids) - 1)
-        depths = np.maximum(frame.points[rows, 2], 0.0)
         expected, _, is_in_view = predict_pixels(
-            frame.left_rays[rows], depths, left_T_left_keyframe, camera.model_number, camera.intrinsics,
-            camera.distortion,
+            frame.left_rays[rows], self._inverse_depths[0, rows], left_T_left_keyframe, camera.model_number,
+            camera.intrinsics, camera.distortion,
         )  # fmt: skip
         found_px, found, _ = self._registered(ids, expected, image, left_T_left_keyframe, min_gradient)
         is_there: Bool = np.linalg.norm(found_px - expected, axis=1) < _MAX_OFF_PX

@@ -27,18 +27,20 @@ class FeaturesAhead:
     frameset whose final pose is missing; at the end the place at work is finished, and the others are left for
     `extract_places`.
 
-    Attributes:
-        stamps_ns: of the places whose features are in the database, in order; complete at the end.
-        database: its path; the file is made at the start.
+    Args:
+        source: of the images.
+        rig: of their cameras.
+        session: its name in the database.
+        database: path; a new file, or that of an interrupted run of the same.
+        config: of all stages.
     """
 
     def __init__(self, source: Source, rig: Rig, session: str, database: Path, config: Config) -> None:
         settings = config.optimization
-        self.stamps_ns: list[int] = []
         self._source = source
         self._rig = rig
         self._session = session
-        self.database = database
+        self._database = database
         self._config = config
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)
         self._epochs: dict[int, int] = {}  # of framesets whose final pose is awaited, in order
@@ -79,13 +81,12 @@ class FeaturesAhead:
     def _work(self) -> None:
         try:
             with (
-                FeatureDatabase(self.database) as database,
+                FeatureDatabase(self._database) as database,
                 PlaceObserver(self._rig, self._config, in_processes=True) as observer,
             ):
                 while (stamp_ns := self._chosen.get()) is not None and not self._is_stopped:
                     if not is_stored(database, self._rig, self._session, stamp_ns):
                         seen = observer.look(self._source.frameset_at(stamp_ns))
                         store_place(database, self._rig, self._session, stamp_ns, seen)
-                    self.stamps_ns.append(stamp_ns)
         except GraphvioError:
             pass  # `extract_places` meets it again, and reports it
