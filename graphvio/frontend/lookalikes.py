@@ -23,7 +23,7 @@ def without_lookalikes(
 ) -> Agreement:
     """Leave out the hypotheses whose points are where the first one has them, too.
 
-    Unless its own points are also where they have them: then nothing tells which is right.
+    Unless its own points are also where they have them: then either may be right.
 
     Args:
         agreement: of the frameset's motion.
