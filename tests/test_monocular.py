@@ -1251,19 +1251,18 @@ def failing(axis: int, factor: float, until_s: float) -> Flight:
     return Failing(*moving())
 
 
-@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (5, 1.7)])
+@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (3, 0.4)])
 def test_estimator_loses_the_pose_if_an_imu_fails_as_no_calibration_is_off(axis: int, factor: float) -> None:
     known: list[CalibrationEstimate | None] = []
     flown = fly(
         failing(axis, factor, 9.0), 6.0, on_keyframe=lambda _, estimator, __: known.append(estimator.calibration)
     )
     assert (EventKind.LOST, "images and IMU contradict each other, whatever the calibration") in flown.events
-    assert flown.stamps_s[-1] < 5.0
     for each in known:
         assert each is None or each.rig.imu is not None  # or it raises: no rig is so wrong
 
 
-@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (3, 0.4)])
+@pytest.mark.parametrize(("axis", "factor"), [(1, 0.4), (5, 1.7)])
 def test_estimator_learns_nothing_of_the_calibration_while_an_imu_fails(axis: int, factor: float) -> None:
     flown = fly(failing(axis, factor, 4.6), 8.0)
     assert flown.statuses[-1] is Status.TRACKING

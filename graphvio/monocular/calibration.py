@@ -16,6 +16,7 @@ from graphvio.monocular.adjustment import Adjusted, equations, evidence_of
 from graphvio.monocular.states import States
 from graphvio.monocular.window_prior import Prior
 from graphvio.rig import Rig
+from graphvio.rig.imu import MAX_MATRIX_ERROR
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import (
     EXACT,
@@ -35,6 +36,7 @@ _FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact 
 _MIN_TWICE_LOG_RATIO = 4.0  # by which factors change: each change moves the window's poses
 _FAR_OFF = 3.0  # factor of a file whose scale is not to be trusted
 _MAX_SIGMAS = 4.0  # no file is so wrong: the window is
+_MAX_SIGMAS_UNDER_WAY = 12.0  # by files of level 3, principal points reach seven
 _WALK = 0.01  # in one second, as a share of the file's standard deviations
 _ESTIMATE_EVERY_NS = 1_000_000_000
 
@@ -115,12 +117,28 @@ class WindowCalibration:
         return self._files[key]
 
     def is_plausible(self, difference: Float) -> bool:
-        """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any.
+        """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any."""
+        return self._is_within(_MAX_SIGMAS, difference)
 
-        An empty one, of a calibration that is not estimated, is.
+    def is_possible(self, difference: Float) -> bool:
+        """Return whether a difference (F,), of a window under way, is one that sensors may have.
+
+        While little is known of a parameter, it may for a moment be three times as far off as is plausible. But the IMU
+        may not have scales and axes that no rig has. An empty difference, of a calibration that is not estimated, is
+        possible.
         """
+        if not len(difference):
+            return True
+        assert self._rig.imu is not None
+        errors = difference[GYRO_MATRIX - PARAMETERS : TIME_OFFSET - PARAMETERS].reshape(2, 3, 3)
+        matrices = (np.eye(3) + errors) @ np.array(self._rig.imu.matrices)
+        is_rig = bool(np.abs(matrices - np.eye(3)).max() < MAX_MATRIX_ERROR)
+        return is_rig and self._is_within(_MAX_SIGMAS_UNDER_WAY, difference)
+
+    def _is_within(self, max_sigmas: float, difference: Float) -> bool:
+        """Return whether a difference (F,) is within so many standard deviations of a file that is as wrong as any."""
         sigmas = MAX_FACTOR * np.sqrt(np.diag(self._prior.covariance))
-        return not len(difference) or bool((np.abs(difference) <= _MAX_SIGMAS * sigmas).all())
+        return bool((np.abs(difference) <= max_sigmas * sigmas).all())
 
     def walk(self, seconds: float) -> Float:
         """Return the lower Cholesky factor (6 + F, 6 + F) of what biases and calibration change in some time.

@@ -307,7 +307,7 @@ class MonocularEstimator:
 
     def _judge(self, stamp_ns: int, solution: Solution) -> Status:
         """Return the status by a solution; end the epoch where images and IMU contradict each other for long."""
-        if not solution.is_plausible:
+        if not solution.is_possible:
             self._solver.discard()
             self._lose(stamp_ns, "images and IMU contradict each other, whatever the calibration")
             return Status.LOST

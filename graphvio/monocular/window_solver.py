@@ -48,13 +48,13 @@ class Solution(NamedTuple):
         imu_errors2: squared whitened errors of the IMU between the states.
         is_tracking: whether enough landmarks constrain the newest state.
         dropped: index of the camera -> tracks that do not stand still.
-        is_plausible: whether the calibration is within what a rig file can be wrong by.
+        is_possible: whether sensors may have such a calibration.
     """
 
     imu_errors2: Float
     is_tracking: bool
     dropped: Mapping[int, Int]
-    is_plausible: bool
+    is_possible: bool
 
 
 class WindowSolver:
@@ -138,13 +138,13 @@ class WindowSolver:
         is_tracking, dropped = self._leave_out_moving(window, adjusted, ids)
         self._solved = Solved(adjusted, ids, window.views[-1])
         self.covariance = _newest_covariance(adjusted)
-        is_plausible = calibration.is_plausible(adjusted.states.calibration)
+        is_possible = calibration.is_possible(adjusted.states.calibration)
         if is_keyframe:
-            if is_plausible:
+            if is_possible:
                 calibration.note(stamp_ns, adjusted.states, self.covariance)
             self._finish_keyframe(window, adjusted)
             self._held = None
-        return Solution(adjusted.equations.imu_errors2, is_tracking, dropped, is_plausible)
+        return Solution(adjusted.equations.imu_errors2, is_tracking, dropped, is_possible)
 
     def end(self, window: KeyframeWindow) -> None:
         """Declare all poses of the window final, and hand its landmarks over."""

@@ -11,7 +11,7 @@ from graphvio.errors import RigError
 from graphvio.rig.values import set_value
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-_MAX_MATRIX_ERROR = 0.2
+MAX_MATRIX_ERROR = 0.2
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Imu:
     def __post_init__(self) -> None:
         for name in ("gyro_matrix", "accel_matrix"):
             matrix = np.array(getattr(self, name), dtype=np.float64).ravel()
-            if matrix.shape != (9,) or not np.abs(matrix - _IDENTITY).max() < _MAX_MATRIX_ERROR:  # also refuses NaN
+            if matrix.shape != (9,) or not np.abs(matrix - _IDENTITY).max() < MAX_MATRIX_ERROR:  # also refuses NaN
                 raise RigError(f"imu: {name} is {matrix.tolist()}; it must be three rows that are nearly the identity")
             set_value(self, name, tuple(matrix.tolist()))
         for name, value in vars(self).items():
