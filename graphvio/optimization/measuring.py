@@ -8,7 +8,6 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from graphvio.odometry import Odometry
-from graphvio.odometry.step import Step
 from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.record import Recorder
 from graphvio.pipeline import RunListener, run
@@ -42,10 +41,6 @@ def measure(
     """
     is_as_given = True
 
-    def note_step(step: Step) -> None:
-        nonlocal is_as_given
-        is_as_given &= step.estimate.epoch == 0
-
     def note_calibration(_: int, estimate: CalibrationEstimate) -> None:
         nonlocal is_as_given
         is_as_given &= estimate.is_file_exact
@@ -60,11 +55,10 @@ def measure(
             on_views=recorder.add_views,
             on_progress=lambda progress: on_progress(progress.framesets, progress.total),
         ),
-        RunListener(on_step=note_step),
     ]
     if ahead is not None:
         listeners.append(RunListener(on_step=ahead.add, on_smoothed=ahead.add_smoothed))
     shutil.rmtree(folder, ignore_errors=True)
     with ResultWriter(folder, odometry.rig, odometry.config.to_yaml()) as writer, ahead or nullcontext():
-        run(source, odometry, writer, listeners)
-    return is_as_given and not odometry.rig_warnings
+        summary = run(source, odometry, writer, listeners)
+    return is_as_given and len(summary.epochs) <= 1 and not odometry.rig_warnings
