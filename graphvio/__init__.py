@@ -1,4 +1,4 @@
-"""graphvio: visual-inertial odometry for rigs of several stereo pairs.
+"""graphvio: visual-inertial odometry for rigs of stereo pairs and single cameras.
 
 The names below are loaded when they are first used, so that ``import graphvio`` stays fast.
 """

@@ -1,4 +1,4 @@
-"""Names of the array types that the whole package uses."""
+"""Type aliases of the arrays that the whole package uses."""
 
 from typing import Any
 

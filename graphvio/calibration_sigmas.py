@@ -1,4 +1,4 @@
-"""How far a rig file's calibration is known: standard deviations, and named levels of them."""
+"""Standard deviations of a rig file's calibration, and named levels of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.errors import RigError
 
 _MARGIN_SIGMAS = 3.0
-_MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
+_MAX_MARGIN_PX = 5.0  # beyond this, patches are not registered
 
 
 @dataclass(frozen=True)
@@ -17,20 +17,20 @@ class CalibrationSigmas:
     """Standard deviations of a rig file's calibration.
 
     Attributes:
-        focal_share: of each focal length, as a share of it.
-        principal_point_px: of each coordinate of a principal point.
-        distortion_share: of each distortion coefficient, as a share of it.
-        stereo_rotation_deg: of the rotation of ``right_T_left``, about each axis.
-        stereo_baseline_share: of the translation of ``right_T_left``, each coordinate, as a share of the baseline.
-        body_rotation_deg: of all cameras together in body, about each axis.
-        body_translation_m: of all cameras together in body, each coordinate.
-        pair_rotation_deg: of each pair relative to the first one, about each axis.
-        pair_translation_m: of each pair relative to the first one, each coordinate.
-        time_offset_s: of the IMU's time offset.
-        imu_scale_share: of the scale of each axis of gyro and accelerometer.
-        imu_misalignment_deg: of each axis of gyro and accelerometer.
-        estimated: whether an estimation of the calibration found them. Errors are as large as they say then: the rig
-            is not taken for exact, as one whose standard deviations are those of its kind may be.
+        focal_share: standard deviation of each focal length, as a share of it.
+        principal_point_px: standard deviation of each coordinate of a principal point.
+        distortion_share: standard deviation of each distortion coefficient, as a share of it.
+        stereo_rotation_deg: standard deviation of the rotation of ``right_T_left``, about each axis.
+        stereo_baseline_share: standard deviation of each coordinate of ``right_T_left``, as a share of the baseline.
+        body_rotation_deg: standard deviation of the rotation of all cameras together in body, about each axis.
+        body_translation_m: standard deviation of the position of all cameras together in body, each coordinate.
+        pair_rotation_deg: standard deviation of the rotation of each pair relative to the first one, about each axis.
+        pair_translation_m: standard deviation of the position of each pair relative to the first one, each coordinate.
+        time_offset_s: standard deviation of the IMU's time offset.
+        imu_scale_share: standard deviation of the scale of each axis of gyro and accelerometer.
+        imu_misalignment_deg: standard deviation of the direction of each axis of gyro and accelerometer.
+        estimated: whether they come from an estimation of the calibration. Errors then are as large as these standard
+            deviations say, and the rig is never pinned as exact; one with typical standard deviations may be.
 
     Raises:
         RigError: if a value is not positive and finite.
@@ -61,10 +61,10 @@ class CalibrationSigmas:
         return {name: value for name, value in vars(self).items() if name != "estimated"}
 
     def epipolar_margin_px(self, focal_px: float, rotation_deg: float) -> float:
-        """Return by how much epipolar lines may be off near the middle of the image: 3 sigma, but no more than 5 px.
+        """Return the possible error of epipolar lines near the middle of the image: 3 sigma, but no more than 5 px.
 
         Args:
-            focal_px: of the cameras.
+            focal_px: focal length of the cameras, px.
             rotation_deg: standard deviation of their rotation to each other.
         """
         turned_px = np.deg2rad(rotation_deg) * focal_px
@@ -80,4 +80,4 @@ class CalibrationSigmas:
 
 FACTORY = CalibrationSigmas()
 LEVELS = {"kalibr": FACTORY.scaled(0.3), "factory": FACTORY, "cad": FACTORY.scaled(5.0)}
-"""Levels by name: a careful calibration with a target, that of a factory some months ago, drawings."""
+"""Levels by name: a careful calibration with a target, a factory calibration some months ago, CAD drawings."""

@@ -1,4 +1,4 @@
-"""Typed errors: every message says what is wrong, where, and what to do."""
+"""Typed errors, whose messages say what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class TrajectoryError(GraphvioError):
 
 
 class MissingExtraError(GraphvioError):
-    """An optional part of graphvio is used that is not installed."""
+    """An optional part of graphvio that is used is not installed."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(f"{purpose} needs {package}: install it with  pip install 'graphvio[{extra}]'")
 
 
 class MissingRequirementError(GraphvioError):
-    """A package is not installed that graphvio cannot do without."""
+    """A package that graphvio requires is not installed."""
 
     def __init__(self, packages: Sequence[str]) -> None:
         names = ", ".join(packages)
@@ -50,7 +50,7 @@ class SessionError(GraphvioError):
 
 
 class CalibrationError(GraphvioError):
-    """The transform between cameras cannot be determined from their motions."""
+    """A calibration cannot be determined from the measurements, or its results cannot be written."""
 
 
 class OptimizationError(GraphvioError):
@@ -77,7 +77,7 @@ def reading(place: object, error: type[GraphvioError], remedy: str) -> AbstractC
     """Raise a failure of the file system as a typed error.
 
     Args:
-        place: that is read.
+        place: file or folder that is read, for the message.
         error: type to raise.
         remedy: what to do, the end of the message.
 
@@ -91,7 +91,7 @@ def writing(place: object, error: type[GraphvioError], remedy: str) -> AbstractC
     """Raise a failure of the file system as a typed error, as `reading` does.
 
     Args:
-        place: that is written to.
+        place: file or folder that is written to, for the message.
         error: type to raise.
         remedy: what to do, the end of the message.
 
@@ -111,12 +111,12 @@ def _accessing(what: str, error: type[GraphvioError], remedy: str) -> Iterator[N
 
 @contextmanager
 def importing(package: str, extra: str, purpose: str) -> Iterator[None]:
-    """Raise a failing import as an error that says how to install what is missing.
+    """Raise a failing import as an error that says how to install the missing package.
 
     Args:
-        package: that is imported.
-        extra: of graphvio, which the package is in.
-        purpose: what needs it, the beginning of the message.
+        package: package that is imported.
+        extra: extra of graphvio that includes the package.
+        purpose: what needs the package, the beginning of the message.
 
     Raises:
         MissingExtraError: if something inside cannot be imported.

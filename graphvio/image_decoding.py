@@ -62,13 +62,13 @@ def decode_grey(data: bytes, where: str) -> Image:
         return grey if grey is not None else _decode_by_opencv(data, where)
     if not data:
         raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is empty")
-    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:  # some writers pad
+    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:  # some writers pad the file
         raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is truncated")
     return _decode_by_opencv(data, where)
 
 
 def _decode_by_opencv(data: bytes, where: str) -> Image:
-    """Decode any format of OpenCV, which fills missing parts with grey and reports success: check for these before."""
+    """Decode any format of OpenCV, which fills missing parts with grey and reports success: detect these beforehand."""
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

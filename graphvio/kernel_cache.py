@@ -1,8 +1,8 @@
-"""Folders of compiled kernels.
+"""Cache folders of compiled kernels.
 
 numba notices an edit to a kernel's own file but not to a file whose kernels it calls. The cache folder of a module is
-therefore named after a digest of its source and of all that it imports from this package: outdated machine code is
-never run by mistake, and an upgrade compiles only what changed.
+therefore named after a digest of its source and of all sources that it imports from this package: outdated machine code
+is never run by mistake, and an upgrade compiles only modules that changed.
 """
 
 import functools
@@ -41,7 +41,7 @@ def cache_root() -> Path:
 
 
 def shared_root() -> Path | None:
-    """Return a ``GRAPHVIO_CACHE_DIR`` that can only be read, as one that all users of a machine share."""
+    """Return ``GRAPHVIO_CACHE_DIR`` if it is read-only, such as one that all users of a machine share; else None."""
     chosen = os.environ.get("GRAPHVIO_CACHE_DIR")
     if not chosen:
         return None
@@ -50,7 +50,7 @@ def shared_root() -> Path | None:
 
 
 def cache_folders(module: str) -> list[Path]:
-    """Return the folders that may hold code of a module's kernels, that which new code is written to first."""
+    """Return the folders that may hold code of a module's kernels; new code is written to the first."""
     roots = [root for root in (cache_root(), shared_root()) if root is not None]
     return [root / source_digest(module) for root in roots]
 
@@ -61,7 +61,7 @@ def any_compiled_before(module: str) -> bool:
 
 
 def compiled_names(modules: Iterable[str]) -> list[str]:
-    """Return the names of the modules' kernels that have code in a cache, that which was compiled last at the end."""
+    """Return the names of the modules' kernels that have code in a cache, in the order of their compilation."""
     times: dict[tuple[str, str], float] = {}
     for module in modules:
         for folder in cache_folders(module):
@@ -73,7 +73,7 @@ def compiled_names(modules: Iterable[str]) -> list[str]:
 
 @functools.cache
 def source_digest(module: str) -> str:
-    """Return a module's name with a digest of its source and of all that it imports from this package."""
+    """Return a module's name with a digest of its source and of all sources that it imports from this package."""
     sources: dict[str, bytes] = {}
     pending = [module]
     while pending:
@@ -95,13 +95,13 @@ def _source(module: str) -> tuple[bytes, list[str]]:
     imported = []
     for package, names in _IMPORT.findall(source.decode()):
         imported.append(package)
-        if _file(package).name == "__init__.py":  # what is imported from it may be modules
+        if _file(package).name == "__init__.py":  # names that are imported from it may be modules
             named = [f"{package}.{name}" for name in _NAME.findall(names)]
             imported += [each for each in named if _file(each).is_file()]
     return hashlib.sha256(source).digest(), imported
 
 
 def _file(module: str) -> Path:
-    """Return where the source of a module or package is, if there is one."""
+    """Return the path of a module's or package's source, which need not exist."""
     path = _PACKAGE.parent.joinpath(*module.split("."))
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")

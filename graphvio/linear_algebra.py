@@ -1,8 +1,8 @@
-"""Products, eigenvectors and solvers of small symmetric matrices for kernels, in the thread that calls them.
+"""Products, eigenvectors and solvers of small symmetric matrices for kernels, computed in the calling thread.
 
-BLAS and LAPACK choose their code by the processor and, for some processors, by where an array lies in memory: last bits
-would depend on both. They start threads of their own for a few hundred unknowns, which take the cores from the odometry
-and wait for each other; and numba compiles its interface to LAPACK for 10 s.
+BLAS and LAPACK choose their code by the processor and, for some processors, by an array's place in memory: the last
+bits of results would depend on both. They start threads of their own for a few hundred unknowns, which take the cores
+from the odometry and wait for each other; and numba takes 10 s to compile its interface to LAPACK.
 """
 
 import numpy as np
@@ -67,7 +67,7 @@ def inverse(matrix: Float) -> Float:
     """Return the inverse (N, N) of a positive definite matrix; NaN where it is not positive definite."""
     n = len(matrix)
     lower = cholesky(matrix)
-    inverted = np.zeros((n, n))  # of lower, transposed
+    inverted = np.zeros((n, n))  # inverse of lower, transposed
     for r in range(n):
         inverted[r, r] = 1.0 / lower[r, r]
         for c in range(r + 1, n):
@@ -107,7 +107,7 @@ def product(a: Float, b: Float) -> Float:
 
 @kernel
 def turn_rows(by: Float, at: int, matrix: Float) -> None:
-    """Multiply three rows of a matrix (N, M), from one on, by the transpose of ``by`` (3, 3)."""
+    """Multiply three rows of a matrix (N, M), from row ``at`` on, by the transpose of ``by`` (3, 3), in place."""
     for c in range(matrix.shape[1]):
         first, second, third = matrix[at, c], matrix[at + 1, c], matrix[at + 2, c]
         for r in range(3):
@@ -126,12 +126,12 @@ def squared_length(vector: Float, covariance: Float) -> float:
 
 @kernel
 def eigen(matrix: Float) -> tuple[Float, Float]:
-    """Return the eigenvalues (N,), in no order, and the eigenvectors (N, N) in columns, of a symmetric matrix.
+    """Return the eigenvalues (N,), unordered, and the eigenvectors (N, N) in columns, of a symmetric matrix.
 
-    By Jacobi's rotations (G. Golub, C. Van Loan, *Matrix Computations*, 2013, section 8.5).
+    They are computed by Jacobi's rotations (G. Golub, C. Van Loan, *Matrix Computations*, 2013, section 8.5).
 
     Raises:
-        LinAlgError: if it is not finite.
+        LinAlgError: if the matrix is not finite.
     """
     n = len(matrix)
     turned, axes = matrix.copy(), np.eye(n)
@@ -167,5 +167,5 @@ def eigen(matrix: Float) -> tuple[Float, Float]:
 
 
 def times(matrix: Float, vector: Float) -> Float:
-    """Multiply in a fixed order: a library's last digits depend on where arrays lie in memory."""
+    """Return ``matrix vector``, summed in a fixed order: a library's last digits depend on arrays' place in memory."""
     return product(np.ascontiguousarray(matrix), vector.reshape(-1, 1))[:, 0]

@@ -1,4 +1,4 @@
-"""A whole run: source -> odometry -> results."""
+"""A whole run of the odometry, from a source to results."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _MAX_PENDING_FRAMESETS = 100
 
 @dataclass
 class Progress:
-    """How far a run has come.
+    """The progress of a run.
 
     Attributes:
-        framesets: estimated so far.
-        total: framesets that the source will yield at most.
+        framesets: number of framesets estimated so far.
+        total: largest number of framesets that the source will yield.
         recorded_s: time covered, by the recording's clock.
         wall_s: time spent.
         distance_m: path length so far.
@@ -63,13 +63,13 @@ class RunListener:
     """Callbacks that follow a run, in the thread of the run.
 
     Attributes:
-        on_step: takes each step of the odometry, see `graphvio.odometry.Odometry.subscribe`.
-        on_estimate: takes each estimate, after its frameset, or None where that is no longer in memory.
-        on_event: takes each event of the odometry.
-        on_calibration: takes each calibration that came into force, with the stamp of the frameset.
-        on_smoothed: takes stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window.
-        on_views: takes the views of landmarks by a rig of single cameras only, see `graphvio.Odometry.on_views`.
-        on_progress: takes the progress after each frameset.
+        on_step: receives each step of the odometry, see `graphvio.odometry.Odometry.subscribe`.
+        on_estimate: receives the frameset (None if it is no longer in memory) and its estimate.
+        on_event: receives each event of the odometry.
+        on_calibration: receives the stamp of the frameset and each calibration that came into force.
+        on_smoothed: receives stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window.
+        on_views: receives the views of landmarks by a rig of single cameras only, see `graphvio.Odometry.on_views`.
+        on_progress: receives the progress after each frameset.
     """
 
     on_step: Callable[[Step], None] = _ignore
@@ -85,10 +85,10 @@ def run(source: Source, odometry: Odometry, writer: ResultWriter, listeners: Seq
     """Run the odometry over a source and write the results.
 
     Args:
-        source: of the measurements.
-        odometry: that has processed nothing yet, of the source's rig, or of the same with another calibration.
-        writer: of the results.
-        listeners: called in this order.
+        source: source of the measurements.
+        odometry: odometry that has processed nothing yet, of the source's rig or of that with another calibration.
+        writer: writer of the results.
+        listeners: listeners, called in this order.
 
     Raises:
         GraphvioError: if the source cannot be read or the folder not written.
@@ -121,7 +121,7 @@ class _Run:
         self._start = perf_counter()
 
     def execute(self) -> Summary:
-        """Process all measurements; a frameset's time is that of the odometry alone."""
+        """Process all measurements; the time that is measured for a frameset is that of the odometry alone."""
         for measurement in self._source:
             if isinstance(measurement, FrameSet):
                 self._add_frameset(measurement)
@@ -142,7 +142,7 @@ class _Run:
         return self._writer.finish(self._finished(wall_s), self._source.truth)
 
     def _finished(self, wall_s: float) -> FinishedRun:
-        """Return what is known at the end of the run, which has taken a time."""
+        """Return the data of the finished run, which took ``wall_s``."""
         framesets = self._framesets + self._source.faults.counts.get(EventKind.FRAMESET_EMPTY, 0)
         return FinishedRun(
             wall_s=wall_s,

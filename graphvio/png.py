@@ -1,6 +1,6 @@
 """Decoding of grey PNG files, of which most recordings consist, in less than half of OpenCV's time.
 
-OpenCV's decoder needs two thirds of the processor time that the odometry of the images needs.
+OpenCV's decoder needs two thirds of the processor time of the odometry itself.
 
 Reference: Portable Network Graphics (PNG) Specification, W3C, sections 5 (chunks), 9 (filters) and 11.2.2 (IHDR).
 """
@@ -20,7 +20,7 @@ from graphvio.kernels import kernel
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">IIBBBBB")
 _PLAIN_GREY = (0, 0, 0, 0)  # colour type, compression, filters, no interlacing
-_MAX_EXPANSION = 1032  # of Deflate
+_MAX_EXPANSION = 1032  # largest ratio of expansion by Deflate
 _SUB, _UP, _AVERAGE, _PAETH = 1, 2, 3, 4
 
 
@@ -32,7 +32,7 @@ def decode_grey_png(data: bytes) -> Image | None:
     """Decode a PNG file of grey pixels of 8 or 16 bits.
 
     Of 16 bits the upper 8 are returned. PNG predicts each byte of a pixel from the same byte of other pixels, so the
-    lower ones are never computed.
+    lower bytes are never computed.
 
     Args:
         data: contents of the file.
@@ -89,12 +89,12 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 
 @kernel
 def undo_filters(filtered: Image, step: int, image: Image) -> bool:
-    """Compute the pixels from the filtered rows, each of which says how its bytes were predicted.
+    """Compute the pixels from the filtered rows, each of which names the filter that predicted its bytes.
 
     Args:
-        filtered: (height, 1 + step * width) filter of the row, and its bytes; of these, each ``step``-th is used.
+        filtered: (height, 1 + step * width) rows: filter, then the filtered bytes, of which each ``step``-th is used.
         step: bytes of a pixel.
-        image: (1 + height, width), written from its second row on; the first has to be zero.
+        image: (1 + height, width) result, written from its second row on; the first row has to be zero.
 
     Returns:
         Whether all filters are known.
@@ -127,9 +127,9 @@ def undo_filters(filtered: Image, step: int, image: Image) -> bool:
 
 @kernel
 def _undo_paeth(filtered: Image, step: int, image: Image, y: int, next_y: int) -> None:
-    """Undo Paeth's filter of row y and of the next, which may be the same, the next one pixel behind.
+    """Undo Paeth's filter of row y and of ``next_y``, one pixel behind; both may be the same row.
 
-    A pixel has to wait for its left neighbour; a processor computes one of each row at the same time.
+    A pixel has to wait for its left neighbour; so the processor can compute one pixel of each row at the same time.
     """
     width = image.shape[1]
     above_left = np.int64(image[y, 0])  # numba's sums of unsigned and signed integers are float64
@@ -151,7 +151,7 @@ def _undo_paeth(filtered: Image, step: int, image: Image, y: int, next_y: int) -
 
 @kernel
 def _paeth(left: np.int64, above: np.int64, above_left: np.int64) -> np.int64:
-    """Predict a byte by that of its neighbours which is nearest to ``left + above - above_left``."""
+    """Return the neighbour of a byte that is nearest to ``left + above - above_left``."""
     to_left, to_above = abs(above - above_left), abs(left - above_left)
     to_above_left = abs(left + above - 2 * above_left)
     other = above if to_above <= to_above_left else above_left

@@ -1,4 +1,4 @@
-"""Bounded queues between threads, and distribution of items to several readers on top of them."""
+"""Bounded queues between threads, and distribution of items to several readers by such queues."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class WhenFull(Enum):
-    """What happens when an item is put where there is no room."""
+    """Behaviour when an item is put into a full queue."""
 
     WAIT = auto()
     """The writer waits for room."""
@@ -22,7 +22,7 @@ class WhenFull(Enum):
 
 
 class Limit(NamedTuple):
-    """How many items may wait, and what happens to more."""
+    """The capacity of a lane, and the behaviour when it is full."""
 
     capacity: int
     when_full: WhenFull
@@ -31,12 +31,12 @@ class Limit(NamedTuple):
 class BoundedQueue(Generic[T]):
     """First-in, first-out queue between threads, which either end can close.
 
-    Items may belong to lanes with limits of their own. They are taken in the order in which they were put, whatever
-    their lanes.
+    Items may belong to lanes with separate limits. They are taken in the order in which they were put, across all
+    lanes.
 
     Args:
-        capacity: how many items of the default lane may wait.
-        when_full: what happens to more.
+        capacity: number of items of the default lane that may wait.
+        when_full: behaviour when the default lane is full.
         lanes: limits of other lanes, by name.
     """
 
@@ -52,8 +52,8 @@ class BoundedQueue(Generic[T]):
         """Add an item.
 
         Args:
-            item: to add.
-            lane: of the item.
+            item: item to add.
+            lane: lane of the item.
 
         Returns:
             Whether it was added: not if the queue is closed, or the item was dropped.
@@ -79,10 +79,10 @@ class BoundedQueue(Generic[T]):
         """Take the oldest item, and wait for it if there is none.
 
         Args:
-            timeout_s: how long to wait; None waits until there is an item or the queue is closed.
+            timeout_s: longest wait, s; None waits until there is an item or the queue is closed.
 
         Returns:
-            The item, or None if none came in time or none will.
+            The item, or None if none came in time, or the queue is closed and empty.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
@@ -118,11 +118,11 @@ class BoundedQueue(Generic[T]):
             return self._is_closed and not self._items
 
     def waiting(self, lane: str = "") -> int:
-        """Return how many items of a lane wait."""
+        """Return the number of items of a lane that wait."""
         return self._waiting[lane]
 
     def dropped(self, lane: str = "") -> int:
-        """Return how many items of a lane were dropped for lack of room."""
+        """Return the number of items of a lane that were dropped because it was full."""
         return self._dropped[lane]
 
     def __len__(self) -> int:
@@ -138,10 +138,10 @@ class Broadcast(Generic[T]):
         self._is_closed = False
 
     def subscribe(self, capacity: int) -> BoundedQueue[T]:
-        """Make a queue for one reader, who closes it to unsubscribe.
+        """Return a new queue for one reader, who closes it to unsubscribe.
 
         Args:
-            capacity: how many items may wait; a slow reader loses the oldest.
+            capacity: number of items that may wait; a slow reader loses the oldest.
 
         Returns:
             The queue of all items that are published from now on.
@@ -156,7 +156,7 @@ class Broadcast(Generic[T]):
         return queue
 
     def publish(self, item: T) -> None:
-        """Hand an item to all readers; returns at once."""
+        """Put an item into all readers' queues; this returns at once."""
         with self._lock:
             self._queues = [queue for queue in self._queues if queue.put(item)]
 

@@ -1,7 +1,7 @@
 """Settings of the whole process: threads, memory and signals.
 
 No object of the library changes the process that it runs in. The command line makes the settings of this module; a
-program that embeds graphvio makes those that suit it:
+program that embeds graphvio chooses among them:
 
 - `set_up_threads`, since front-end and self-calibration have threads, with which OpenCV's would compete, and which
   would wait for each other for milliseconds;
@@ -29,7 +29,7 @@ from typing import Any, Self
 
 from graphvio.errors import MissingExtraError
 
-_M_ARENA_MAX = -8  # of glibc's malloc.h
+_M_ARENA_MAX = -8  # defined in glibc's malloc.h
 _SWITCH_INTERVAL_S = 0.0005
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -42,7 +42,7 @@ def usable_cores() -> int:
 
 
 def set_up_threads() -> None:
-    """Switch off OpenCV's own threads in this process, and let Python's take turns every half millisecond.
+    """Switch off OpenCV's threads in this process, and let Python switch between threads every half millisecond.
 
     By default a thread that waits for the interpreter gets it after 5 ms, which is most of a frameset's time.
     """
@@ -53,10 +53,10 @@ def set_up_threads() -> None:
 
 
 def limit_blas_threads() -> None:
-    """Let BLAS compute in the thread that calls it, in this process and its children; before numpy is imported.
+    """Let BLAS compute in the calling thread, in this process and its children; call this before numpy is imported.
 
-    OpenBLAS has a thread for each core, and those that have nothing to do wait in a loop for the others: they take the
-    cores from the odometry. A number that the environment has in ``OPENBLAS_NUM_THREADS`` stays.
+    OpenBLAS has a thread for each core, and idle ones wait in a busy loop for the others: they take the cores from the
+    odometry. A value of ``OPENBLAS_NUM_THREADS`` in the environment is kept.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -64,8 +64,9 @@ def limit_blas_threads() -> None:
 def share_heap() -> bool:
     """Let all threads of this process that are started from now on allocate from one heap.
 
-    glibc gives threads heaps of their own, between which nothing is exchanged: a process through which images pass
-    keeps the free memory of each, and grows for minutes. It is as ``MALLOC_ARENA_MAX=1`` in the environment.
+    glibc gives threads separate heaps, between which no memory is exchanged: a process whose threads pass on images
+    keeps the free memory of each heap, and grows for minutes. The setting is that of ``MALLOC_ARENA_MAX=1`` in the
+    environment.
 
     Returns:
         Whether the C library has such an option. Heaps that exist already remain in use.
@@ -77,11 +78,11 @@ def share_heap() -> bool:
 
 
 def has_mixed_zlib() -> bool:
-    """Return whether the zlib of the system calls functions of pycolmap's, which is of another version.
+    """Return whether the system's zlib calls functions of pycolmap's zlib, which is of another version.
 
-    pycolmap's wheel exports the functions of its own zlib, and loads the system's as a dependency, which then takes
-    them for its own unless it was there before: whatever Python compresses corrupts the heap. Importing `zlib` before
-    pycolmap keeps them apart, which ``import graphvio`` does; afterwards nothing can.
+    pycolmap's wheel exports the functions of its own zlib, and loads the system's as a dependency. Unless that was
+    loaded before, it then calls the wheel's functions: whatever Python compresses corrupts the heap. Importing `zlib`
+    before pycolmap, as ``import graphvio`` does, keeps them apart; afterwards nothing can.
     """
     modules = list(sys.modules)
     if "pycolmap" not in modules or not sys.platform.startswith("linux"):
@@ -101,10 +102,10 @@ def has_mixed_zlib() -> bool:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """End what is inside by `KeyboardInterrupt` at Ctrl-C, even if it came while compiled code ran.
+    """End the block by `KeyboardInterrupt` at Ctrl-C, even if it came while compiled code ran.
 
-    Compiled kernels end by a `SystemError` in whose chain of causes the interrupt is, compiled libraries that are being
-    loaded by an `ImportError`, which may have been taken for a missing library.
+    Compiled kernels end by a `SystemError` with the interrupt in its chain of causes; compiled libraries that are being
+    loaded end by an `ImportError`, which may have been taken for a missing library.
 
     Raises:
         KeyboardInterrupt: At Ctrl-C.
@@ -118,13 +119,13 @@ def interruptible() -> Iterator[None]:
 
 
 def on_interrupt(handler: Callable[[], None]) -> Callable[[], None]:
-    """Call a function at the next Ctrl-C, and act as before at those that follow.
+    """Call a function at the next Ctrl-C, and restore the previous behaviour for later ones.
 
     Args:
         handler: Called in the main thread.
 
     Returns:
-        A function that ends this earlier.
+        A function that restores the previous behaviour at once.
     """
     before: list[Any] = []
 
@@ -141,7 +142,7 @@ def on_interrupt(handler: Callable[[], None]) -> Callable[[], None]:
 
 
 class HeldInterrupt:
-    """Holds back Ctrl-C inside until `check`, so that nothing is left half written; a second one has its usual effect.
+    """Defers Ctrl-C within the block until `check`, so that nothing is left half written; a second one acts as usual.
 
     Outside of the main thread, and where Ctrl-C is ignored, nothing changes.
     """
@@ -160,10 +161,10 @@ class HeldInterrupt:
         self._restore()
 
     def check(self) -> None:
-        """End what is inside if Ctrl-C came.
+        """End the block if Ctrl-C came.
 
         Raises:
-            KeyboardInterrupt: If it did.
+            KeyboardInterrupt: If Ctrl-C came.
         """
         if self._came:
             raise KeyboardInterrupt
@@ -182,10 +183,10 @@ class HeldInterrupt:
 
 
 class StopSignals:
-    """Takes note of the first Ctrl-C or SIGTERM inside, so that all can be saved; a second one has its usual effect.
+    """Records the first Ctrl-C or SIGTERM within the block, so that all can be saved; a second one acts as usual.
 
     Attributes:
-        came: Whether one did.
+        came: Whether such a signal came.
     """
 
     def __init__(self) -> None:
@@ -194,7 +195,7 @@ class StopSignals:
 
     def __enter__(self) -> Self:
         for number in _STOP_SIGNALS:
-            if signal.getsignal(number) not in (signal.SIG_IGN, None):  # as in the background of a script
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):  # ignored in the background of a script
                 self._before[number] = signal.signal(number, self._note)
         return self
 
@@ -213,7 +214,7 @@ class StopSignals:
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """End what is inside by `KeyboardInterrupt` at SIGTERM, as at Ctrl-C, so that what it started is cleaned up."""
+    """End the block by `KeyboardInterrupt` at SIGTERM, as at Ctrl-C, so that what it started is cleaned up."""
     if signal.getsignal(signal.SIGTERM) in (signal.SIG_IGN, None):
         yield
         return
@@ -226,7 +227,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def stop_signals_blocked() -> Iterator[None]:
-    """Deliver Ctrl-C and SIGTERM after what is inside; processes that are started inside begin with both blocked."""
+    """Deliver Ctrl-C and SIGTERM only after the block; processes that are started in it begin with both blocked."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
     try:
         yield
@@ -235,10 +236,10 @@ def stop_signals_blocked() -> Iterator[None]:
 
 
 def ignore_stop_signals() -> None:
-    """Let a handler that does nothing take Ctrl-C and SIGTERM: the parent process ends this one.
+    """Handle Ctrl-C and SIGTERM by doing nothing, as the parent process ends this one.
 
     Ignored or blocked signals would be inherited by processes that are started here; handlers are not, so that signals
-    still end those.
+    still end those processes.
     """
     for number in _STOP_SIGNALS:
         signal.signal(number, lambda *_: None)

@@ -11,7 +11,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 clock: Callable[[], float] = perf_counter
-"""Seconds: what all times of stages are taken from. A benchmark puts a clock of processor time in its place."""
+"""The clock, in seconds, by which all stages are timed. A benchmark replaces it by a clock of processor time."""
 
 
 class HasStageTimes(Protocol):
@@ -24,7 +24,7 @@ T = TypeVar("T", bound=HasStageTimes)
 
 
 def timed(stage: str) -> Callable[[Callable[Concatenate[T, P], R]], Callable[Concatenate[T, P], R]]:
-    """Make a method add its processing time to ``self.stage_ms[stage]``."""
+    """Return a decorator that makes a method add its processing time to ``self.stage_ms[stage]``."""
 
     def decorate(method: Callable[Concatenate[T, P], R]) -> Callable[Concatenate[T, P], R]:
         @wraps(method)
@@ -41,14 +41,14 @@ def timed(stage: str) -> Callable[[Callable[Concatenate[T, P], R]], Callable[Con
 
 
 class Stopwatch:
-    """Adds up the time between calls, under the name of the stage that has just ended."""
+    """Adds up the time between calls of `lap`, under the name of the stage that has just ended."""
 
     def __init__(self) -> None:
         self.stage_ms: dict[str, float] = {}
         self._since = clock()
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last call to a stage."""
+        """Add the time since the last call to the time of a stage."""
         now = clock()
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (now - self._since)
         self._since = now

@@ -81,11 +81,11 @@ class Trajectory:
         return Trajectory(self.stamps_ns[which], self.nav_T_body[which])
 
     def around(self, begin_ns: int, end_ns: int) -> Trajectory:
-        """Select the poses of a time, with one more on either side for interpolation.
+        """Select the poses within a period of time, with one more on either side for interpolation.
 
         Args:
-            begin_ns: where it begins, nanoseconds.
-            end_ns: where it ends.
+            begin_ns: begin of the period, nanoseconds.
+            end_ns: end of the period, nanoseconds.
 
         Returns:
             The trajectory of these poses.

@@ -1,8 +1,8 @@
 """Trajectory files: TUM, EuRoC and KITTI text formats, and topics with poses in a session or bag.
 
 TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point; ORB-SLAM3
-writes it with nanoseconds, which of a Unix time cannot be seconds. EuRoC: ``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``,
-separated by commas. UZH-FPV's truth is TUM's with a row number in front.
+writes it with stamps in nanoseconds, which are recognised as a Unix time would be absurdly large in seconds. EuRoC:
+``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. UZH-FPV's ground truth is TUM's with a row number in front.
 Stamps are converted exactly: float64 resolves only 0.2 microseconds of a Unix time.
 """
 
@@ -37,10 +37,10 @@ def load_trajectory(path: str | Path, times: Path | None = None) -> Trajectory:
     """Read a trajectory file, or a trajectory in a session or bag.
 
     Args:
-        path: TUM, EuRoC or KITTI poses, distinguished by separator and number of columns; KITTI's take their stamps
-            from ``times.txt`` next to them or in ``../sequences/NAME``. Or a session or bag, with its true trajectory
-            or only topic with poses; ``PATH:TOPIC`` names another.
-        times: stamps in seconds, one a line, of KITTI poses elsewhere.
+        path: file of TUM, EuRoC or KITTI poses, distinguished by separator and number of columns; stamps of KITTI poses
+            are read from ``times.txt`` next to them or in ``../sequences/NAME``. Or a session or bag, of which the true
+            trajectory or the only topic with poses is read; ``PATH:TOPIC`` names another topic.
+        times: file with the stamps of KITTI poses, seconds, one a line, if it is elsewhere.
 
     Returns:
         The poses in the order of their stamps.
@@ -62,8 +62,8 @@ def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
     """Write a TUM file: nine decimals on the stamp, ``q_w >= 0``.
 
     Args:
-        trajectory: of poses ``nav_T_body``.
-        path: of the file, which is replaced.
+        trajectory: trajectory of poses ``nav_T_body``.
+        path: path of the file, which is replaced if it exists.
 
     Raises:
         TrajectoryError: if the file cannot be written.
@@ -83,7 +83,7 @@ def tum_line(stamp_ns: int, nav_T_body: Float) -> str:
 
 
 def _fixed(value: float) -> str:
-    """Format with nine decimals, without negative zero."""
+    """Format a value with nine decimals, without negative zero."""
     text = f"{value:.9f}"
     return text[1:] if text == "-0.000000000" else text
 
@@ -104,7 +104,7 @@ def stamp_ns_from_seconds(text: str) -> int:
 
 
 def _unit_of(stamp_s: str) -> str:
-    """Return the unit of a Unix time that would be absurd in seconds; empty if there is none."""
+    """Return the unit of a Unix time that is not in seconds; empty if it may be in seconds, or is no Unix time."""
     try:
         stamp = abs(Decimal(stamp_s))
         units = [unit for unit, power in _UNITS.items() if _UNIX_S[0] <= stamp.scaleb(-power) < _UNIX_S[1]]
@@ -121,10 +121,10 @@ def _in_other_unit(where: str, unit: str) -> TrajectoryError:
 
 
 def _refuse_other_units(stamps_ns: Sequence[int], is_euroc: bool, path: Path) -> None:
-    """Refuse stamps that are as far apart as only those in another unit are.
+    """Refuse stamps whose intervals show that they are in another unit.
 
     Raises:
-        TrajectoryError: if they are.
+        TrajectoryError: if they are in another unit.
     """
     if len(stamps_ns) <= _MIN_STEPS:
         return
@@ -220,7 +220,7 @@ def _rows(text: str) -> Iterator[tuple[int, Sequence[str], bool]]:
 
 
 def _is_numbered(fields: Sequence[str]) -> bool:
-    """Return whether a row has its number before a pose: then only its last four columns are a rotation."""
+    """Return whether a row has a row number before the pose: then only its last four columns are a unit quaternion."""
     if len(fields) != _COLUMNS + 1 or not fields[0].isdecimal():
         return False
     try:

@@ -1,9 +1,9 @@
-"""Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives.
+"""Warm-up, which compiles or loads from the cache every kernel of the odometry, before the first image arrives.
 
-Compiling takes a minute of one core. Where the cache is empty, two other processes do it: one for tracking and IMU, one
-for what estimates a motion, or the window of single cameras, and then, while the odometry may begin, for the
-self-calibration, which is to wait for it. This process stays as small as with a full cache. Another program that
-compiles at the same time is waited for.
+Compiling takes a minute of one core. Where the cache is empty, two other processes do it: one for tracking and IMU; one
+for the estimation of motions, or the window of single cameras, and afterwards for the self-calibration, which waits for
+it while the odometry may begin. This process stays as small as with a full cache. If another program compiles at the
+same time, the warm-up waits for it.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ _COMPILED_LAST = ("graphvio.frontend.imaging.lucas_kanade", "graphvio.backend.pr
 _MOTION, _WINDOW = "graphvio.frontend.motion.refinement", "graphvio.self_calibration.moving_landmarks"
 _OTHER_PROCESS = "import sys; from graphvio.warmup import compile_for_another; compile_for_another(sys.argv[1])"
 _PARTS = ("tracking", "motion")
-_IS_COMPILED = b"."  # what a process writes when it has what a first pose needs
-_NEW_OBJECTS = 20_000  # after which garbage is collected; with Python's 700 that takes an eighth of the time
+_IS_COMPILED = b"."  # written by a process when it has compiled the kernels for a first pose
+_NEW_OBJECTS = 20_000  # between garbage collections; with Python's 700 they take an eighth of the time
 
 
 def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> None:
@@ -68,10 +68,10 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
     Args:
         rig: the rig, for its image size and its IMU.
         config: configuration of all stages.
-        wait_for_calibration: whether the kernels of the self-calibration are waited for too where they have to be
-            compiled; else the self-calibration waits for them when it has seen enough.
+        wait_for_calibration: whether to wait also for the kernels of the self-calibration where they have to be
+            compiled; else the self-calibration waits for them when it needs them.
     """
-    if not rig.pairs:  # whose calibration the window estimates, by its own kernels
+    if not rig.pairs:  # the window estimates the calibration, with its own kernels
         config = replace(config, calibration=replace(config.calibration, online=False))
     if not _are_compiled(rig, config):
         _compile_in_parallel(rig, config)
@@ -83,10 +83,10 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
 
 
 def compile_for_another(part: str) -> None:
-    """Compile one of the `_PARTS`, as a process of its own, and after the motions what is needed later.
+    """Compile one of the `_PARTS` as a separate process; after the motions, compile kernels that are needed later.
 
     Args:
-        part: which one, for the rig and the configuration that come pickled in the standard input.
+        part: name of the part; its rig and configuration are read, pickled, from the standard input.
     """
     gc.set_threshold(_NEW_OBJECTS)
     rig, config = pickle.load(sys.stdin.buffer)
@@ -95,7 +95,7 @@ def compile_for_another(part: str) -> None:
     if part == "motion" and config.estimates_calibration:
         warm_up_adjustment(rig)
     if part == "motion" and not rig.pairs:
-        _warm_up_motion(rig, config)  # for the closure of loops
+        _warm_up_motion(rig, config)  # kernels for loop closure
 
 
 def _warm_up_part(part: str, rig: Rig, config: Config) -> None:
@@ -110,7 +110,7 @@ def _warm_up_part(part: str, rig: Rig, config: Config) -> None:
 
 
 def _are_compiled(rig: Rig, config: Config) -> bool:
-    """Return whether the cache holds the kernels, as far as the modules that are compiled last show."""
+    """Return whether the cache holds the kernels, judged by the modules that are compiled last."""
     modules = [*_COMPILED_LAST, _MOTION if rig.pairs else _WINDOW]
     if config.estimates_calibration:
         modules.append(_CALIBRATION)
@@ -120,13 +120,13 @@ def _are_compiled(rig: Rig, config: Config) -> bool:
 def _compile_in_parallel(rig: Rig, config: Config) -> None:
     """Compile the kernels in two other processes; only one program does so at a time.
 
-    It returns once both have what a first pose needs, or have failed: what is missing is compiled here then. They hold
-    the lock until they have finished.
+    Return once both have compiled the kernels for a first pose, or have failed: missing kernels are then compiled in
+    this process. The other processes hold the lock until they have finished.
     """
     with (cache_root() / "compiling.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if _are_compiled(rig, config):
-            return  # by the program that was waited for
+            return  # compiled by another program meanwhile
         announce_compilation()
         compilers = [_started(part, pickle.dumps((rig, config)), lock) for part in _PARTS]
         for compiler in compilers:
@@ -135,19 +135,19 @@ def _compile_in_parallel(rig: Rig, config: Config) -> None:
 
 
 def _started(part: str, rig_and_config: bytes, lock: IO[str]) -> subprocess.Popen[bytes]:
-    """Return a new process that compiles a part."""
+    """Start a process that compiles a part, and return it."""
     command, pipe = [sys.executable, "-c", _OTHER_PROCESS, part], subprocess.PIPE
     compiler = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, pass_fds=[lock.fileno()])
     compile_elsewhere(compiler)
     assert compiler.stdin is not None
-    with suppress(BrokenPipeError):  # it does not find graphvio, for instance
+    with suppress(BrokenPipeError):  # the process has failed, for instance because it does not find graphvio
         compiler.stdin.write(rig_and_config)
         compiler.stdin.close()
     return compiler
 
 
 def _track_singles(rig: Rig, config: Config, rng: np.random.Generator) -> None:
-    """Call the kernels by which single cameras find each other's tracks."""
+    """Call the kernels that find tracks of single cameras in each other's images."""
     frontend = SinglesFrontend(rig, config)
     for stamp_ns in range(2):
         images = [rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in rig.cameras]

@@ -1,4 +1,4 @@
-"""Names in messages: the known one that is most like an unknown one, and lists that stay short."""
+"""Names in messages: a suggestion for an unknown name, and lists of limited length."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ _MAX_LISTED = 8
 
 
 def nearest(key: str, names: Iterable[str]) -> str:
-    """Suggest, for the end of a message, the known name that is most like an unknown one.
+    """Return a suggestion for the end of a message: the known name that is most similar to an unknown one.
 
     Args:
         key: the unknown name.
-        names: all known ones.
+        names: all known names.
 
     Returns:
-        A clause that begins with "; ", or an empty text where no known name is like it.
+        A clause that begins with "; ", or an empty text where no known name is similar.
     """
     close = difflib.get_close_matches(key, list(names), n=1, cutoff=_MIN_SIMILARITY)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def listed(names: Iterable[str]) -> str:
-    """List names for a message: the first few and the number of the others, or ``none``."""
+    """Return a list of names for a message: the first few and the number of the others, or ``none``."""
     known = list(names)
     if len(known) <= _MAX_LISTED + 1:
         return ", ".join(known) or "none"

@@ -1,20 +1,21 @@
-"""Which of the motions is the rig's, where the pairs contradict each other."""
+"""The choice of the rig's motion where the camera pairs measure motions that contradict each other."""
 
 from collections.abc import Callable
 
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.motion import RelativeMotion, VisualResult
 
-_MIN_LIKELIER = 6.0  # difference of the statistics that decides without an IMU: 20 to 1
+_MIN_LIKELIER = 6.0  # difference of chi-square statistics that decides without an IMU: odds of 20 to 1
 
 
 class Contradiction:
-    """The choice between motion hypotheses by what the state estimator predicts.
+    """Chooses between motion hypotheses by comparing them with the state estimator's prediction.
 
-    An IMU refuses a motion that is not the rig's. Without one, the prediction is constant velocity, which refuses
-    hardly any; but whatever comes into one view and moves changes that view's velocity at once, while the others' goes
-    on. So the first frameset with a contradiction decides, and as long as it lasts the same pairs are followed: later,
-    an object's velocity is as constant as the rig's.
+    With an IMU, the innovation test rejects a motion that is not the rig's. Without one, the prediction is constant
+    velocity, and the test rejects hardly any motion; but an object that comes into one view and moves changes that
+    view's velocity at once, while the velocity of the other views continues. So the first frameset with a contradiction
+    decides, and the pairs chosen there are followed as long as the contradiction lasts: later, an object's velocity is
+    as constant as the rig's.
     """
 
     def __init__(self) -> None:
@@ -27,9 +28,9 @@ class Contradiction:
         """Return the motion to use and its gate result.
 
         Args:
-            visual: Result with a motion.
+            visual: Result of the visual front-end, with a motion.
             gate: Innovation test of the estimator.
-            has_imu: Whether an IMU predicts.
+            has_imu: Whether the prediction is by an IMU.
         """
         assert visual.motion is not None
         tested = sorted(((gate(motion), motion) for motion in visual.alternatives), key=lambda each: each[0].statistic)
@@ -50,7 +51,7 @@ class Contradiction:
 
 
 def _clearly_predicted(tested: list[tuple[GateResult, RelativeMotion]]) -> frozenset[int]:
-    """Return the pairs, of which none sees a second motion, whose motion is by far the likeliest, or none."""
+    """Return the pairs of the likeliest motion if it is clearly likelier and no pair supports another; else none."""
     (likely, motion), *others = tested
     is_decided = likely.accepted and _is_less_likely(others[0][0], likely)
     is_whole = all(set(motion.pairs).isdisjoint(other.pairs) for _, other in others)

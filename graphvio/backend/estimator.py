@@ -1,6 +1,6 @@
 """The interface of a state estimator, as the odometry uses it.
 
-`SmootherEstimator` and `FilterEstimator` implement it, and without stereo pairs `MonocularEstimator`.
+`SmootherEstimator` and `FilterEstimator` implement it, and `MonocularEstimator` for rigs without stereo pairs.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from graphvio.measurements.motion import LocatedPoints, RelativeMotion, VisualRe
 
 @dataclass(frozen=True, eq=False)
 class MeasurementUpdate:
-    """What became of a frameset's measurements.
+    """The outcome of the update with a frameset's measurements.
 
     Attributes:
         motion: The relative motion that constrains the newest state, or None where there is none or it was
             rejected by the gate.
-        partial_motion: What few points show of the motion, if it was used; it does not constrain the state by itself.
+        partial_motion: The motion by a few points, if it was used; it does not constrain the state by itself.
         needs_keyframe: Whether later motions have to be measured from the newest frameset, because no state is kept
             that they could be measured from otherwise.
     """
@@ -42,8 +42,8 @@ class StateUpdate:
 
     Attributes:
         status: What the estimate is based on.
-        needs_keyframe: As with `MeasurementUpdate`.
-        outliers: Of a rig without pairs, camera index -> identities of tracks that do not stand still.
+        needs_keyframe: As in `MeasurementUpdate`.
+        outliers: For a rig without stereo pairs, camera index -> identities of tracks of points that move.
     """
 
     status: Status
@@ -52,10 +52,10 @@ class StateUpdate:
 
 
 class StateEstimator(Protocol):
-    """The state of the rig over time (section 5).
+    """An estimator of the rig's state over time (section 5).
 
-    Once for each frameset: `initialise` or `predict`, then `apply` and `update`. Refused measurements, breaks and
-    reinitialisations are reported as events to the function that the estimator is made with.
+    It is called once for each frameset: `initialise` or `predict`, then `apply` and `update`. It reports refused
+    measurements, breaks and reinitialisations as events to a function that is passed to its constructor.
 
     Attributes:
         epoch: Number of declared breaks until now.
@@ -78,7 +78,7 @@ class StateEstimator(Protocol):
 
     @property
     def has_pose(self) -> bool:
-        """Whether the newest state has a pose. One of single cameras has none until the scale is known."""
+        """Whether the newest state has a pose. With single cameras only, it has none until the scale is known."""
 
     @property
     def has_imu(self) -> bool:
@@ -105,32 +105,32 @@ class StateEstimator(Protocol):
         """
 
     def located_points(self) -> dict[int, LocatedPoints]:
-        """Return the points of known distance that single cameras see at the newest state, by camera.
+        """Return, by camera index, the points of known distance that single cameras see at the newest state.
 
-        Empty where the front-end locates the points.
+        Empty for estimators that leave the location of points to the front-end.
         """
 
     def take_final(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` that became final since the last call, not always in time order."""
 
     def add_sample(self, stamp_ns: int, values: Float) -> None:
-        """Add an IMU sample, if single ones are needed beside the intervals between framesets.
+        """Add an IMU sample, for estimators that need single samples beside the intervals between framesets.
 
         Args:
-            stamp_ns: On the framesets' clock.
+            stamp_ns: Stamp of the sample on the framesets' clock.
             values: (6,) angular velocity, rad/s, and specific force, m/s^2.
         """
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Initialise the state at a frameset, with roll and pitch from the IMU if there is one.
 
-        Where there is a state already, which is so when an IMU comes after an initialisation without, a new epoch
-        begins at its position.
+        The paper's filter is also called with a state, when the first IMU samples come after an initialisation without
+        an IMU: a new epoch then begins at the state's position.
 
         Args:
             stamp_ns: Stamp of the frameset.
-            imu: The IMU around the frameset, and the frameset's place in that interval in seconds; None initialises
-                without an IMU.
+            imu: The IMU readings around the frameset, and the frameset's time in that interval, seconds; None
+                initialises without an IMU.
         """
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
@@ -138,16 +138,16 @@ class StateEstimator(Protocol):
 
         Args:
             stamp_ns: Stamp of the frameset.
-            interval: The IMU since the newest state; None predicts by constant velocity.
+            interval: The IMU readings since the newest state; None predicts by constant velocity.
 
         Returns:
-            Whether later motions have to be measured from the frameset before, because the state was reinitialised.
+            Whether later motions have to be measured from the previous frameset, because the state was reinitialised.
         """
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
-        """Test what was measured against the prediction, and insert what passes (section 5).
+        """Test the measurements against the prediction, and insert those that pass (section 5).
 
-        A gate that stays closed for too long is itself at fault: the state is then reinitialised.
+        If motions are refused for too long, the prediction is considered wrong, and the state is reinitialised.
 
         Args:
             visual: The front-end's result for the frameset.
@@ -159,8 +159,8 @@ class StateEstimator(Protocol):
 
         Args:
             stamp_ns: Stamp of the newest state.
-            is_constrained: Whether vision constrains it, or it has just been initialised; `MonocularEstimator` ignores
-                it, since its window shows that.
+            is_constrained: Whether vision constrains the state, or it has just been initialised; `MonocularEstimator`
+                ignores this argument, since its window shows it.
             keep: Stamps of states that later motions will be measured from. If `stamp_ns` is among them, the newest
                 frameset is a keyframe; `MonocularEstimator` relies on this.
         """
@@ -171,39 +171,39 @@ class StateEstimator(Protocol):
 
 @runtime_checkable
 class ImuFaultTolerant(Protocol):
-    """What a `StateEstimator` has in addition, if it can go on by vision alone while the IMU contradicts vision.
+    """Additional methods of a `StateEstimator` that can go on by vision alone while the IMU contradicts vision.
 
-    The odometry watches the IMU of an estimator that has these methods, see `graphvio.odometry.imu_watch`, and the
-    self-calibration reports wrong corrections of the IMU to it.
+    If an estimator has these methods, the odometry compares the IMU with vision, see `graphvio.odometry.imu_watch`, and
+    the self-calibration reports wrong corrections of the IMU's calibration to the estimator.
     """
 
     def leave_imu_out(self) -> None:
-        """Record that the IMU is not used until `use_imu_again`: the initialisation no longer waits for it."""
+        """Stop using the IMU until `use_imu_again`: meanwhile, the initialisation does not wait for it."""
 
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
         """Use the IMU again: keep the newest pose, and take biases and gravity from a comparison with vision.
 
         Args:
-            motion: By vision, that ends in the newest state.
-            match: How the IMU moves beside vision.
+            motion: A motion by vision that ends in the newest state.
+            match: Result of the comparison of the IMU with vision.
         """
 
     def use_late_imu(self, motion: RelativeMotion, imu: tuple[ImuInterval, float]) -> None:
-        """Use the IMU from now on, after an initialisation without: keep the newest pose, and take gravity from it.
+        """Use the IMU from now on, after an initialisation without it: keep the newest pose, and take gravity from it.
 
         Args:
-            motion: By vision, that ends in the newest state.
-            imu: The IMU around the state and the state's place in that interval, seconds.
+            motion: A motion by vision that ends in the newest state.
+            imu: The IMU readings around the state, and the state's time in that interval, seconds.
         """
 
     def use_inertial_state(self, known: InertialState) -> bool:
-        """Go on with velocity, biases and gravity from a keyframe that contradicts the state's.
+        """Replace velocity, biases and gravity by those known at a keyframe, if the state's contradict these.
 
-        Not if they are known much less well, or the keyframe has left the window; nor while the estimate is lost,
-        motions are refused, or the IMU is left out. Pose and epoch go on, and no event is reported.
+        Nothing is changed if the keyframe's values are known much less well or it has left the window, nor while the
+        estimate is lost, motions are refused, or the IMU is left out. Pose and epoch go on, and no event is reported.
 
         Args:
-            known: At a keyframe, by its frameset's stamp.
+            known: Velocity, biases and gravity at a keyframe, which its frameset's stamp identifies.
 
         Returns:
             Whether the state was changed, so that later motions have to be measured from the newest frameset.
@@ -216,4 +216,4 @@ class ImuFaultTolerant(Protocol):
         """
 
     def pose_by_vision(self) -> Float:
-        """Return ``nav_T_body`` (4, 4) of the newest state; while motions are refused, the one that they lead to."""
+        """Return ``nav_T_body`` (4, 4) of the newest state; while motions are refused, the pose that these lead to."""

@@ -1,4 +1,4 @@
-"""Factors of the smoother other than those of vision, and the keys of its variables."""
+"""The smoother's factors other than the visual ones, and the keys of its variables."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
-_GRAVITY_SIGMA_M_S2 = 0.02  # of its length, on Earth
+_GRAVITY_SIGMA_M_S2 = 0.02  # variation of the length of gravity on Earth
 _MIN_GRAVITY_SIGMA_M_S2 = 1e-3
-_MIN_INERTIAL_SIGMA = 1e-4  # of m/s, m/s^2, rad/s
-_X, _V, _B, _R, _G, _SUM = (int(gtsam.symbol(letter, 0)) for letter in "xvbrgs")  # a call for each key takes longer
-_ZERO_VELOCITY_SIGMA_M_S = 0.005  # of the velocity while the images do not move
+_MIN_INERTIAL_SIGMA = 1e-4  # m/s, m/s^2, rad/s: added to the covariance of `_inertial_prior`
+_X, _V, _B, _R, _G, _SUM = (int(gtsam.symbol(letter, 0)) for letter in "xvbrgs")  # faster than a call for each key
+_ZERO_VELOCITY_SIGMA_M_S = 0.005  # standard deviation of the velocity while the images stand still
 
 
 def x(k: int) -> int:
@@ -50,7 +50,7 @@ def g() -> int:
 def first_state(
     k: int, state: RigState, uncertainty: InitialUncertainty, with_imu: bool
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the priors of the first state; with a joint covariance they are those of gravity's direction, too."""
+    """Yield the priors on the first state; with a joint inertial covariance, they include gravity's direction."""
     yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(state.nav_T_body), gaussian(uncertainty.pose))
     if with_imu and uncertainty.inertial is not None:
         yield _inertial_prior(k, state, uncertainty.inertial)
@@ -62,21 +62,21 @@ def first_state(
 
 
 def gravity(gravity_nav: Float, uncertainty: InitialUncertainty) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the priors of gravity in nav: of its direction, unless `first_state` has it, and of its length.
+    """Yield the priors on gravity in nav: on its direction, unless `first_state` yields it, and on its length.
 
     Args:
-        gravity_nav: (3,) m/s^2.
-        uncertainty: of the first state.
+        gravity_nav: (3,) gravity in nav, m/s^2.
+        uncertainty: the uncertainty of the first state.
     """
     if uncertainty.inertial is None:
-        along = np.outer(gravity_nav, gravity_nav)  # says next to nothing of the length
+        along = np.outer(gravity_nav, gravity_nav)  # leaves the length almost free
         floor = _MIN_GRAVITY_SIGMA_M_S2**2 * np.eye(3)
         yield gtsam.PriorFactorVector(g(), gravity_nav, gaussian(uncertainty.gravity + along + floor))
     yield gtsam.CustomFactor(isotropic(1, _GRAVITY_SIGMA_M_S2), [g()], _length_error)
 
 
 def _inertial_prior(k: int, state: RigState, covariance: Float) -> gtsam.NonlinearFactor:
-    """Return the joint prior of velocity, biases and gravity, by their covariance (12, 12)."""
+    """Return the joint prior on velocity, biases and gravity with their covariance (12, 12)."""
     whitener = np.linalg.inv(np.linalg.cholesky(covariance + _MIN_INERTIAL_SIGMA**2 * np.eye(12)))
     linear = gtsam.JacobianFactor(
         v(k),
@@ -106,21 +106,22 @@ def _length_error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: l
 def constant_velocity(
     i: int, j: int, motion: Float, dt: float, after_s: float, rate_sigmas: Float, accel_sigmas: Float
 ) -> gtsam.NonlinearFactor:
-    """Return a factor between two states that continue at constant velocity and angular rate (eq. 11 and 12).
+    """Return a factor of constant velocity and angular rate between two states (eq. 11 and 12).
 
-    The motion is that of `graphvio.backend.smoother.Smoother.extend`, which repeats the one before. The paper's noise
-    is that of one step; this one is of unknown accelerations that stay constant since the motion was last measured.
+    The motion comes from `graphvio.backend.smoother.Smoother.extend`, which repeats the previous one. The paper's noise
+    is that of one step; this one models unknown accelerations that have been constant since the motion was last
+    measured.
 
     Args:
-        i: a state.
-        j: the next one.
-        motion: from one to the other (4, 4).
-        dt: time between them, s.
-        after_s: time since velocity and rate were measured, s.
-        rate_sigmas: (2,) of rate and velocity when they were measured, rad/s and m/s.
-        accel_sigmas: (2,) rad/s^2 and m/s^2.
+        i: index of a state.
+        j: index of the next state.
+        motion: (4, 4) motion from state i to state j.
+        dt: time between the states, s.
+        after_s: time from the last measurement of velocity and rate to state j, s.
+        rate_sigmas: (2,) standard deviations of rate and velocity when they were measured, rad/s and m/s.
+        accel_sigmas: (2,) standard deviations of angular and linear acceleration, rad/s^2 and m/s^2.
     """
-    # An unknown constant acceleration moves by a t^2 / 2: the variance grows by steps of a^2 t^4 / 4.
+    # An unknown constant acceleration a leads to an error a t^2 / 2: each step adds the growth of a^2 t^4 / 4.
     growth = 0.5 * np.sqrt(after_s**4 - (after_s - dt) ** 4)
     sigmas = np.repeat(np.hypot(accel_sigmas * growth, rate_sigmas * dt), 3)
     return gtsam.BetweenFactorPose3(x(i), x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
@@ -129,9 +130,9 @@ def constant_velocity(
 def imu_without_samples(
     i: int, j: int, dt: float, accel_sigma_m_s2: float, imu: Imu, noise_scale: float
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield factors of a constant velocity and of the biases' random walk.
+    """Yield the factors of a step without IMU samples: constant velocity, and random walk of the biases.
 
-    The velocity's noise is that of an unknown acceleration which is constant within the step.
+    The noise of the velocity is that of an unknown acceleration which is constant within the step.
     """
     yield gtsam.BetweenFactorVector(v(i), v(j), np.zeros(3), isotropic(3, accel_sigma_m_s2 * dt))
     walk = noise_scale * np.sqrt(dt)
@@ -154,19 +155,19 @@ def zero_velocity_noise() -> gtsam.noiseModel.Isotropic:
 def position_reset(
     keys: list[int], covariance: Float, sigma_m: float, values: gtsam.Values
 ) -> tuple[Float, gtsam.NonlinearFactor]:
-    """Make a position certain up to its correlation with other variables, which stays as it is (section 5).
+    """Return a factor that resets a position's own uncertainty, but not its correlation with others (section 5).
 
-    Given the others, the position is normally distributed about a linear function of them. The factor narrows that
-    distribution about its mean, so that the marginal of the others does not change.
+    Given the other variables, the position is normally distributed about a linear function of them. The factor narrows
+    that conditional distribution about its mean, so that the marginal of the other variables does not change.
 
     Args:
-        keys: the pose, then the others.
-        covariance: (6 + M, 6 + M) of all of them, at their present values.
-        sigma_m: what is left of the position's own standard deviation.
-        values: present values.
+        keys: the key of the pose, then those of the other variables.
+        covariance: (6 + M, 6 + M) joint covariance of these variables at their present values.
+        sigma_m: conditional standard deviation of the position after the reset.
+        values: present values of the variables.
 
     Returns:
-        The part of the position's covariance (3, 3), in body, that is forgotten, and the factor.
+        The part of the position's covariance (3, 3), in body, that the factor removes, and the factor.
     """
     order = np.concatenate([np.arange(3, 6), np.arange(3), np.arange(6, len(covariance))])
     ordered = covariance[np.ix_(order, order)]
@@ -185,10 +186,10 @@ def position_reset(
 
 
 def _linear(terms: list[tuple[int, Float]]) -> gtsam.GaussianFactor:
-    """Return the factor of unit noise whose error (3,) is the sum of some variables times matrices (3, D).
+    """Return the factor of unit noise whose error (3,) is a sum of matrices (3, D) times variables.
 
-    gtsam's constructors take three variables from Python. More are made of two factors that share one more variable,
-    each with half of the variance, by eliminating it.
+    gtsam's constructors take at most three variables from Python. For four, two factors that share an auxiliary
+    variable, each with half of the variance, are joined by eliminating that variable.
     """
     unit = gtsam.noiseModel.Unit.Create(3)
     if len(terms) == 1:

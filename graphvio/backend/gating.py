@@ -12,7 +12,7 @@ from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.gate_result import GateResult
 
-_MIN_SIGMAS = 5.0  # of an excess that counts
+_MIN_SIGMAS = 5.0  # by which a length must exceed its bound to count
 
 
 def relative_covariance(a_T_b: Float, joint: Float) -> Float:
@@ -28,13 +28,13 @@ def gate_motion(
     predicted_covariance: Float,
     probability: float,
 ) -> GateResult:
-    """Test the innovation of a motion.
+    """Test a measured motion against its prediction.
 
     Args:
-        measured: (4, 4) motion.
-        measured_covariance: (6, 6) in the frame that it ends in.
-        predicted: (4, 4) motion.
-        predicted_covariance: (6, 6) in the frame that it ends in.
+        measured: (4, 4) measured motion.
+        measured_covariance: (6, 6) covariance of the measured motion, in the frame that it ends in.
+        predicted: (4, 4) predicted motion.
+        predicted_covariance: (6, 6) covariance of the predicted motion, in the frame that it ends in.
         probability: Share of correct measurements that pass.
     """
     innovation = se3_log(se3_inverse(predicted) @ measured)
@@ -42,7 +42,7 @@ def gate_motion(
 
 
 def gate_innovation(innovation: Float, covariance: Float, probability: float) -> GateResult:
-    """Test an innovation (M,) with a covariance (M, M); a share of correct ones given by ``probability`` passes."""
+    """Test an innovation (M,) with its covariance (M, M); ``probability`` is the share of correct ones that pass."""
     statistic = squared_length(innovation, covariance)
     threshold = chi_square_quantile(probability, len(innovation))
     return GateResult(statistic <= threshold, statistic, threshold, innovation, covariance)

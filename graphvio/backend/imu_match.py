@@ -1,7 +1,8 @@
-"""Whether an IMU moves as the cameras do, by rotations and accelerations over some seconds of vision.
+"""A test whether an IMU moves as the cameras do, from rotations and accelerations over some seconds of vision.
 
-The mean difference between angular rates is the gyro's bias, so that only their changes can show an agreement. What
-specific forces have beyond the cameras' accelerations must be gravity: one vector of known norm in a frame that stands.
+The mean difference between the angular rates is the gyro's bias, so that only changes of the rates can show an
+agreement. The specific forces minus the cameras' accelerations must be gravity: one constant vector of known norm in a
+fixed frame.
 """
 
 from __future__ import annotations
@@ -19,32 +20,32 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 _MIN_STEPS = 20
 _MIN_COVERED_S = 2.0
 _SHIFT_STEP_S = 0.005
-_COARSE = 4  # such steps, by which all shifts are compared first
-_LOBE_S = 0.1  # shifts that are closer are of the same minimum
-_DISTINCT = 2.0  # times the least difference that all other shifts must have
-_MIN_CHANGE_RAD_S = 0.1  # of the rates, RMS about their mean: with less, one shift fits as well as another
+_COARSE = 4  # multiple of that step by which all shifts are compared first
+_LOBE_S = 0.1  # shifts closer to each other than this belong to the same minimum
+_DISTINCT = 2.0  # multiple of the least difference that all other shifts must reach
+_MIN_CHANGE_RAD_S = 0.1  # RMS of the rates about their mean: with less, one shift fits as well as another
 _RATE_NOISE_RAD_S = 0.02
 _AVERAGED_S = 0.2  # moving average over this time, applied twice
-_FORCE_NOISE_M_S2 = 0.5  # and bias
-_ERROR_SHARE = 0.1  # of the change: errors of the calibration, and of means over a step
+_FORCE_NOISE_M_S2 = 0.5  # noise and bias of the specific force
+_ERROR_SHARE = 0.1  # relative to the readings' change: errors of the calibration, and of means over a step
 _MAX_GRAVITY_ERROR_M_S2 = 1.0
 
 
 class VisualStep(NamedTuple):
-    """A motion by vision between two successive framesets."""
+    """A motion between two successive framesets, measured by vision."""
 
     begin_ns: int
     end_ns: int
-    begin_T_end: Float  # (4, 4) of body
+    begin_T_end: Float  # (4, 4) motion of body
 
 
 class RateMatch(NamedTuple):
-    """A gyro that turns as the cameras do.
+    """The time shift and bias with which a gyro turns as the cameras do.
 
     Attributes:
-        shift_s: By how many seconds its stamps are late.
+        shift_s: Seconds by which the gyro's stamps are late.
         gyro_bias: (3,) rad/s.
-        difference: RMS of the rates' difference at this shift, as a share of what errors of both explain.
+        difference: RMS difference of the rates at this shift, as a share of what errors of gyro and vision explain.
     """
 
     shift_s: float
@@ -53,12 +54,12 @@ class RateMatch(NamedTuple):
 
 
 class ImuMatch(NamedTuple):
-    """An IMU that moves as the cameras do.
+    """The time shift, bias and gravity with which an IMU moves as the cameras do.
 
     Attributes:
-        shift_s: By how many seconds its stamps are late.
+        shift_s: Seconds by which the IMU's stamps are late.
         gyro_bias: (3,) rad/s.
-        gravity_body: (3,) m/s^2 in body at the end of the last step.
+        gravity_body: (3,) gravity in body at the end of the last step, m/s^2.
     """
 
     shift_s: float
@@ -67,16 +68,16 @@ class ImuMatch(NamedTuple):
 
 
 def match_imu(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> ImuMatch | None:
-    """Find the only shift of its stamps at which the IMU moves as the cameras do.
+    """Find the only shift of the IMU's stamps at which the IMU moves as the cameras do.
 
     Args:
-        steps: By vision, each beginning where the one before ends.
-        readings: Of the IMU, by the framesets' clock.
-        max_shift_s: Largest shift that is tried, either way.
+        steps: The motions by vision, each beginning where the previous one ends.
+        readings: The IMU's readings, with stamps of the framesets' clock.
+        max_shift_s: Largest shift that is tried in either direction.
 
     Returns:
-        None where there is no such shift, where less than 2 s of vision and IMU are known there, or the rig does not
-        turn.
+        The match, or None where there is no such shift, where vision and IMU have less than 2 s in common at it, or
+        where the rig does not turn.
     """
     found = match_rates(steps, readings, max_shift_s)
     if found is None:
@@ -86,9 +87,9 @@ def match_imu(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: 
 
 
 def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s: float) -> RateMatch | None:
-    """Find the only shift of its stamps at which the gyro turns as the cameras do; see `match_imu`.
+    """Find the only shift of the gyro's stamps at which the gyro turns as the cameras do; see `match_imu`.
 
-    Steps may overlap or be apart, and translations are not used.
+    The steps may overlap or leave gaps, and their translations are not used.
     """
     if not steps:
         return None
@@ -100,7 +101,7 @@ def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s
     differences = compared.differences
     best = int(np.argmin(differences))
     least = float(differences[best])
-    # A minimum at the end of the shifts, or of the samples, may be none.
+    # The least difference at an end of the shifts, or where the samples end, need not be a minimum.
     if not 0 < best < 2 * _COARSE or not np.isfinite(differences[best - 1 : best + 2]).all():
         return None
     if not compared.is_alike(best):
@@ -114,10 +115,10 @@ def match_rates(steps: Sequence[VisualStep], readings: MeanReadings, max_shift_s
 
 
 def turn_disagreement(steps: Sequence[VisualStep], readings: MeanReadings) -> float | None:
-    """Return how far apart gyro and cameras turn by the gyro's stamps, as a multiple of what errors of both explain.
+    """Return the difference of the gyro's and cameras' rates without a shift, relative to what errors of both explain.
 
-    It is the median of the steps (at least one), so that a few that vision got wrong do not count. None where the IMU
-    does not cover them, or the rig hardly turns.
+    It is the median over the steps (at least one), so that a few that vision measured wrongly have no influence. None
+    where the IMU does not cover the steps, or the rig hardly turns.
     """
     begins_ns, ends_ns, rates = _rates(steps)
     errors = readings.between(begins_ns, ends_ns)[:, :3] - rates
@@ -131,22 +132,22 @@ def turn_disagreement(steps: Sequence[VisualStep], readings: MeanReadings) -> fl
 class _Compared(NamedTuple):
     """Angular rates of N steps by vision and by the gyro, at S shifts of its stamps."""
 
-    errors: Float  # (S, N, 3) of the gyro, rad/s
-    is_known: Bool  # (S, N)
+    errors: Float  # (S, N, 3) rates of the gyro minus those of vision, rad/s
+    is_known: Bool  # (S, N) whether the IMU covers the step
     differences: Float  # (S,) RMS of the errors about their mean, rad/s; infinite where too few are known
-    changes: Float  # (S,) the same of vision's rates
+    changes: Float  # (S,) RMS of vision's rates about their mean, rad/s
 
     def tolerance(self, at: int) -> float:
-        """Return what errors of vision and gyro explain of the difference at a shift, rad/s."""
+        """Return the largest difference at a shift that errors of vision and gyro explain, rad/s."""
         return _RATE_NOISE_RAD_S + _ERROR_SHARE * float(self.changes[at])
 
     def is_alike(self, at: int) -> bool:
-        """Whether the rates change, and do so together, at a shift."""
+        """Whether, at a shift, vision's rates change and the gyro's rates change with them."""
         return bool(self.changes[at] >= _MIN_CHANGE_RAD_S and self.differences[at] <= self.tolerance(at))
 
 
 def _compared(steps: Sequence[VisualStep], readings: MeanReadings, shifts: Float) -> _Compared:
-    """Compare the rates at some shifts (S,), seconds."""
+    """Compare the rates of vision and gyro at shifts (S,), seconds."""
     begins_ns, ends_ns, rates = _rates(steps)
     shifts_ns = np.rint(shifts * 1e9).astype(np.int64)[:, None]
     by_gyro = readings.between((begins_ns + shifts_ns).ravel(), (ends_ns + shifts_ns).ravel())[:, :3]
@@ -159,14 +160,14 @@ def _compared(steps: Sequence[VisualStep], readings: MeanReadings, shifts: Float
 
 
 def _rates(steps: Sequence[VisualStep]) -> tuple[Int, Int, Float]:
-    """Return stamps (N,) at which steps begin and end, and their angular rates (N, 3), rad/s."""
+    """Return the stamps (N,) at which steps begin, those at which they end, and their angular rates (N, 3), rad/s."""
     begins_ns, ends_ns = (np.array([each[at] for each in steps], dtype=np.int64) for at in (0, 1))
     turns = np.array([so3_log(np.ascontiguousarray(each.begin_T_end[:3, :3])) for each in steps]).reshape(-1, 3)
     return begins_ns, ends_ns, turns / ((ends_ns - begins_ns) * 1e-9)[:, None]
 
 
 def _gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int) -> Float | None:
-    """Return gravity (3,) in body at the end, by specific forces at a shift, or None if they show something else."""
+    """Return gravity (3,) in body at the end of the steps from specific forces at a shift, or None where none fits."""
     first_R_end, against_gravity, accelerations = np.eye(3), [], []
     middles_ns = np.array([(each.begin_ns + each.end_ns) // 2 for each in steps])
     forces = readings.between(middles_ns[:-1] + shift_ns, middles_ns[1:] + shift_ns)[:, 3:]
@@ -180,7 +181,7 @@ def _gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int)
             accelerations.append(acceleration)
     if len(against_gravity) < _MIN_STEPS:
         return None
-    # Second differences of positions of framesets are mostly noise: their means over some tenths of a second are not.
+    # Second differences of the framesets' positions are mostly noise; their means over some tenths of a second are not.
     count = max(round(_AVERAGED_S * 1e9 / float(np.median(np.diff(middles_ns)))), 1)
     mean, change = np.mean(against_gravity, axis=0), _spread(_averaged(np.array(accelerations), count))
     if abs(np.linalg.norm(mean) - GRAVITY_M_S2) > _MAX_GRAVITY_ERROR_M_S2:
@@ -192,7 +193,7 @@ def _gravity(steps: Sequence[VisualStep], readings: MeanReadings, shift_ns: int)
 
 
 def _averaged(vectors: Float, count: int) -> Float:
-    """Return means (M, 3) over so many successive vectors (N, 3), of such means."""
+    """Return the moving average over ``count`` of the vectors (N, 3), applied twice (M, 3)."""
     for _ in range(2):
         vectors = np.lib.stride_tricks.sliding_window_view(vectors, min(count, len(vectors)), axis=0).mean(axis=-1)
     return vectors
@@ -204,7 +205,7 @@ def _spread(vectors: Float) -> float:
 
 
 def _spreads(vectors: Float, is_known: Bool) -> Float:
-    """Return for each set (S,) of vectors (S, N, 3) the RMS of those that are known (S, N) about their mean."""
+    """Return, for each of S sets of vectors (S, N, 3), the RMS of the known ones (S, N) about their mean."""
     count = np.maximum(is_known.sum(axis=1), 1)
     means = np.where(is_known[..., None], vectors, 0.0).sum(axis=1) / count[:, None]
     squares = ((vectors - means[:, None]) ** 2).sum(axis=2)
@@ -212,7 +213,7 @@ def _spreads(vectors: Float, is_known: Bool) -> Float:
 
 
 def _beyond(differences: Float) -> float:
-    """Return how far from the middle one of three shifts the minimum of the parabola through the squares is."""
+    """Return the distance from the middle of three shifts to the minimum of the parabola through the squares, s."""
     before, at, after = np.square(differences)
     curvature = before - 2.0 * at + after
     return float(0.5 * _SHIFT_STEP_S * (before - after) / curvature) if 0.0 < curvature < np.inf else 0.0

@@ -1,4 +1,4 @@
-"""A buffer of IMU samples, which checks them and returns them as intervals."""
+"""A buffer of IMU samples that checks them, and returns their readings over intervals."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ _MIN_CHANGE = 0.02  # an axis that changes in a smaller share of the samples has
 _MAX_CHANGE = 0.95  # share of the samples in which an axis changes that is assumed at most
 _MIN_OTHERS_CHANGE = 0.8  # share of the samples in which another axis of the sensor must go on changing
 _MAX_FROZEN = 5  # times that all axes may repeat their values; some drivers deliver each sample twice
-_MIN_LIVE_CHANGE = 0.5  # share of the samples in which each of them must have changed before
-_MIN_LOG_CHANCE = np.log(1e-9)  # of a working axis that repeats its value so often
-_MIN_MOTION = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2
-_KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
+_MIN_LIVE_CHANGE = 0.5  # share of the samples in which each axis must have changed before
+_MIN_LOG_CHANCE = np.log(1e-9)  # log probability that a working axis repeats its value so often
+_MIN_MOTION = np.repeat([0.2, 1.0], 3)  # range of an axis's values that counts as motion, rad/s and m/s^2
+_KEPT_NS = 60_000_000_000  # no frameset arrives later than this after the samples of its interval
 _ROOM = 1024  # samples that the buffer has room for at first
-_NOISE_SAMPLES = 50  # that show the noise of an interval
+_NOISE_SAMPLES = 50  # number of samples from which the noise of an interval is estimated
 
 
 def value_fault(sample: ImuSample) -> str:
-    """Return the kind of fault of a sample whose values no sensor reads, or an empty string."""
+    """Return the kind of fault of a sample with values that no sensor can read, or an empty string."""
     rate, force = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()  # numpy is slow for three
     if not all(map(isfinite, (*rate, *force))):
         return EventKind.IMU_NOT_FINITE
-    if not any(force):  # nor does free fall give exact zeros
+    if not any(force):  # not even free fall gives exact zeros
         return EventKind.IMU_STUCK
     if max(map(abs, rate)) > _MAX_RATE or max(map(abs, force)) > _MAX_FORCE:
         return EventKind.IMU_OUT_OF_RANGE
@@ -45,7 +45,7 @@ def value_fault(sample: ImuSample) -> str:
 
 
 class ImuBuffer:
-    """IMU samples in time order; unusable ones are named and left out.
+    """Buffer of IMU samples in time order; `add` leaves out unusable ones and returns the kind of their fault.
 
     Args:
         max_gap_ms: Longer intervals between samples are gaps.
@@ -86,11 +86,11 @@ class ImuBuffer:
         return ""
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether a sample at or after an instant has come."""
+        """Whether a sample at or after an instant has been added."""
         return self._end > self._first and bool(self._stamps[self._end - 1] >= stamp_ns)
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two instants, interpolated at both ends, or None where there is a gap."""
+        """Return the readings between two instants, interpolated at both ends, or None where there is a gap."""
         first = self._find(start_ns, "right") - 1
         last = self._find(end_ns, "left")
         if first < self._first or last >= self._end or end_ns <= start_ns:
@@ -107,7 +107,7 @@ class ImuBuffer:
         """Return the longest gapless segment that ends at the newest sample between two instants.
 
         Returns:
-            The interval and its first stamp, or None where there are not two samples.
+            The interval and its first stamp, or None where there are fewer than two samples.
         """
         stamps = self._stamps[self._find(start_ns, "left") : self._find(end_ns, "right")]
         gaps = np.flatnonzero(np.diff(stamps) > self._max_gap_ns)
@@ -116,15 +116,15 @@ class ImuBuffer:
         return None if interval is None else (interval, int(stamps[0]))
 
     def means(self, offset_ns: int = 0) -> MeanReadings:
-        """Return the means of the samples that are kept now, by stamps from which an offset is subtracted."""
+        """Return the means of the samples in the buffer now, with an offset subtracted from their stamps."""
         kept = slice(self._first, self._end)
         return MeanReadings(self._stamps[kept] - offset_ns, self._values[kept].copy(), self._max_gap_ns)
 
     def since(self, stamp_ns: int) -> tuple[Int, Float]:
-        """Return the IMU at an instant, interpolated, and its samples after it.
+        """Return the reading at an instant, interpolated, and all samples after it.
 
         Returns:
-            Stamps (N,) and values (N, 6), angular velocity and specific force; none where the instant is in a gap.
+            Stamps (N,) and values (N, 6), angular velocity and specific force; empty where the instant is in a gap.
         """
         end = self._find(stamp_ns, "right")
         first = end - 1
@@ -138,16 +138,16 @@ class ImuBuffer:
         return stamps, np.vstack([at, self._values[end : self._end]])
 
     def discard_before(self, stamp_ns: int) -> None:
-        """Forget samples that no later interval needs."""
+        """Discard the samples that no interval from an instant on needs."""
         self._first = max(self._find(stamp_ns, "right") - 1, self._first)
 
     def _find(self, stamp_ns: int, side: Literal["left", "right"]) -> int:
         return self._first + int(np.searchsorted(self._stamps[self._first : self._end], stamp_ns, side))
 
     def _make_room(self) -> None:
-        """Move the samples to the front of an array that is twice as large if they fill half of it.
+        """Move the samples to the front of a new array, twice as large if they fill more than half of the old one.
 
-        Samples of more than a minute ago are dropped: an IMU without framesets must not fill the memory.
+        Samples older than a minute are discarded: an IMU without framesets must not fill the memory.
         """
         self.discard_before(int(self._stamps[self._end - 1]) - _KEPT_NS)
         kept = slice(self._first, self._end)
@@ -171,11 +171,11 @@ class MeanReadings:
         self._stamps, self._values = stamps_ns, values
         self._steps_ns = np.diff(stamps_ns)
         means = 0.5 * (values[1:] + values[:-1])
-        self._sums = np.vstack([np.zeros(6), np.cumsum(means * self._steps_ns[:, None], axis=0)])  # until each sample
+        self._sums = np.vstack([np.zeros(6), np.cumsum(means * self._steps_ns[:, None], axis=0)])  # up to each sample
         self._gaps = np.concatenate([[0], np.cumsum(self._steps_ns > max_gap_ns)])
 
     def between(self, begins_ns: Int, ends_ns: Int) -> Float:
-        """Return the means (K, 6) between stamps (K,) and (K,), NaN where an interval is not covered."""
+        """Return the mean readings (K, 6) in K intervals between stamps, NaN where samples do not cover one."""
         if len(self._stamps) < 2:
             return np.full((len(begins_ns), 6), np.nan)
         first, last = self._step_at(begins_ns), self._step_at(ends_ns)
@@ -188,26 +188,26 @@ class MeanReadings:
         return np.clip(np.searchsorted(self._stamps, stamps_ns, "right") - 1, 0, len(self._stamps) - 2)
 
     def _integral(self, k: Int, stamps_ns: Int) -> Float:
-        """Return the integrals until stamps that lie in steps ``k``, between whose ends the readings are linear."""
+        """Return the integrals up to stamps within the steps ``k``, in which the readings change linearly."""
         after_ns = (stamps_ns - self._stamps[k])[:, None]
         slopes = (self._values[k + 1] - self._values[k]) / self._steps_ns[k][:, None]
         return np.asarray(self._sums[k] + after_ns * (self._values[k] + 0.5 * after_ns * slopes))
 
 
 class _StuckAxes:
-    """Detection of axes that repeat one value while others change, as at the end of their range.
+    """Detection of axes that repeat one value while others change, as an axis does at the end of its range.
 
-    An axis that used to change with every sample, as noise makes it, is found within some samples if another axis of
-    the same sensor goes on changing; so is an IMU that repeats all of them. An axis that used to repeat its values is
-    found once others have moved for a while.
+    An axis that used to change with every sample, because of its noise, is found within some samples if another axis of
+    the same sensor goes on changing; so is an IMU that repeats the values of all axes. An axis that used to repeat its
+    values is found once other axes have moved for a while.
     """
 
     def __init__(self) -> None:
         self._before = np.full(6, np.nan)
-        self._low, self._high = np.zeros((2, 6, 6))  # for each axis, the range of all axes since it has its value
-        self._since_ns = np.zeros(6, dtype=np.int64)  # since when each axis repeats its value though others moved
+        self._low, self._high = np.zeros((2, 6, 6))  # for each axis, the range of all axes since it took its value
+        self._since_ns = np.zeros(6, dtype=np.int64)  # stamp since which each axis repeats its value though others move
         self._change = np.zeros(6)  # share of the samples in which each axis changed, up to its last change
-        self._repeats = np.zeros((6, 6))  # for each axis, how often each changed since it has its value; and of itself,
+        self._repeats = np.zeros((6, 6))  # for each axis, how often each changed since it took its value; of itself,
         # how often it has repeated it
 
     def shows(self, sample: ImuSample) -> bool:
@@ -222,7 +222,7 @@ class _StuckAxes:
 
 @kernel
 def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> bool:
-    """Add a sample (6,), and return whether some axis repeats its value beyond what noise allows."""
+    """Add a sample (6,), and return whether some axis repeats its value more often than noise allows."""
     stopped, all_repeat = False, change.min() > _MIN_LIVE_CHANGE
     for axis in range(6):
         if now[axis] != before[axis]:
@@ -248,7 +248,7 @@ def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> boo
 def _note_repeats(
     stamp_ns: int, now: Float, before: Float, low: Float, high: Float, since_ns: Int, has_lived: Bool
 ) -> int:
-    """Add a sample (6,), and return since when some axis has repeated its value though others moved."""
+    """Add a sample (6,), and return the stamp since which some axis repeats its value though others move."""
     for axis in range(6):
         if now[axis] != before[axis]:
             put(low[axis], now)
@@ -266,7 +266,7 @@ def _note_repeats(
 
 @kernel
 def _steps(stamps_ns: Int, values: Float, end_ns: int) -> tuple[Float, Float]:
-    """Return durations (N - 1,) and mean values (N - 1, 6) between samples (N,), clipped to 0 and an end."""
+    """Return the durations (N - 1,) and mean values (N - 1, 6) between samples (N,), clipped to 0 and ``end_ns``."""
     n = len(stamps_ns)
     steps_s, means = np.empty(n - 1), np.empty((n - 1, 6))
     for i in range(n - 1):

@@ -1,4 +1,4 @@
-"""States that an estimator is initialised with: the first one, and one after each kind of break."""
+"""Initial states of an estimator: the first one, and those after each kind of break."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Rig
 
 _UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU any first motion is accepted, on foot or on the road
-_MOVING_SPEED_SIGMA = 5.0  # the gate lets five times as much pass
+_MOVING_SPEED_SIGMA = 5.0  # the gate accepts about five times as much
 _STATIONARY_SPEED_SIGMA = 0.02
 _REINITIALISED_SPEED_SIGMA = 1.0
 _GYRO_BIAS_SIGMA = 0.01
@@ -46,7 +46,7 @@ class InitialState:
     Attributes:
         stamp_ns: Stamp of the state.
         state: The rig at that instant.
-        uncertainty: How well the state is known.
+        uncertainty: Uncertainty of the state.
         is_known: Whether attitude and velocity are known well enough; else the first motions have to complete them.
     """
 
@@ -59,14 +59,14 @@ class InitialState:
 def first_state_at(
     stamp_ns: int, position: Float, imu: tuple[ImuInterval, float] | None, rig: Rig, config: InitialisationConfig
 ) -> InitialState:
-    """Initialise at a position in nav, with roll and pitch from the IMU.
+    """Return the initial state at a position in nav, with roll and pitch from the IMU.
 
     Args:
         stamp_ns: Stamp of the state.
-        position: (3,) m in nav.
-        imu: The IMU around the state and the state's place in that interval, seconds. Without it, the first pair's left
-            camera is taken to be upright, and the speed is unknown.
-        rig: Cameras.
+        position: (3,) position in nav, m.
+        imu: The IMU readings around the state, and the state's time in that interval, seconds. Without them, the first
+            pair's left camera is assumed to be upright, and the speed is unknown.
+        rig: The rig, for its cameras.
         config: Configuration of the initialisation.
     """
     if imu is None:
@@ -83,9 +83,9 @@ def first_state_at(
 
 
 def with_free_gravity(initial: InitialState) -> InitialState:
-    """Let the first pose define all of nav: what is unknown of roll and pitch is gravity's direction in nav.
+    """Return an initial state whose pose defines nav: uncertainty of roll and pitch becomes that of gravity in nav.
 
-    Later measurements then turn gravity, and not the poses.
+    Later measurements then rotate gravity, and not the poses.
     """
     state, known = initial.state, initial.uncertainty
     tilted = gravity_by_tilt(state.nav_T_body[:3, :3], known.pose, state.gravity_nav)
@@ -93,28 +93,28 @@ def with_free_gravity(initial: InitialState) -> InitialState:
 
 
 def after_failure(stamp_ns: int, state: RigState, covariance: StateCovariance) -> InitialState:
-    """Reinitialise at the predicted state, after a window that has no solution.
+    """Return the initial state at the predicted one, after a window that has no solution.
 
     Args:
         stamp_ns: Stamp of the state.
         state: The prediction.
-        covariance: Of the last state that was known.
+        covariance: Covariance of the last state that was solved for.
     """
     return _reinitialised(stamp_ns, state, covariance.pose + _AFTER_REBUILD, covariance.gravity)
 
 
 def after_gap(stamp_ns: int, state: RigState, covariance: StateCovariance) -> InitialState:
-    """Begin an epoch at the last state, after a gap that nothing bridges; arguments as for `after_failure`."""
+    """Return the first state of an epoch at the last state, after an unbridged gap; arguments as in `after_failure`."""
     return _at_kept_pose(stamp_ns, state, covariance.pose + AFTER_JUMP, covariance.gravity)
 
 
 def after_lost(motion: RelativeMotion, state: RigState, covariance: StateCovariance) -> InitialState:
-    """Begin an epoch at the predicted state, with the velocity of the first motion that vision measures again.
+    """Return the first state of an epoch after a lost estimate: the prediction, with the velocity of a first motion.
 
     Args:
         motion: A motion that ends in the state.
         state: The prediction.
-        covariance: Of the prediction.
+        covariance: Covariance of the prediction.
     """
     return _at_kept_pose(motion.stamp_ns, _with_velocity(state, motion), covariance.pose, covariance.gravity)
 
@@ -127,16 +127,17 @@ def from_vision(
     gravity_covariance: Float | None,
     prediction_failed: bool,
 ) -> InitialState:
-    """Reinitialise at the pose that a chain of motions leads to.
+    """Return the initial state at the pose that a chain of refused motions leads to.
 
     Args:
         motion: The last motion of the chain.
         nav_T_body: (4, 4) pose at its end.
         state: The prediction for the same instant.
-        pose_covariance: (6, 6) of the pose at the beginning of the chain, tangent in body; the chain is better known.
-        gravity_covariance: (3, 3) of gravity in nav, or None where it is not estimated.
+        pose_covariance: (6, 6) covariance of the pose at the beginning of the chain, tangent in body; the chain's
+            motions are known better than this pose.
+        gravity_covariance: (3, 3) covariance of gravity in nav, or None where it is not estimated.
         prediction_failed: Whether the prediction is known to be wrong; else vision may be wrong as well, and the pose
-            is uncertain by as much as it differs from the prediction.
+            is uncertain by its difference from the prediction.
     """
     apart = np.zeros(6) if prediction_failed else se3_log(se3_inverse(nav_T_body) @ state.nav_T_body)
     state = _with_velocity(replace(state, nav_T_body=nav_T_body), motion)
@@ -152,14 +153,14 @@ def from_prediction(
     pose_covariance: Float,
     gravity_covariance: Float | None,
 ) -> InitialState:
-    """Reinitialise at the predicted pose, uncertain by as much as a chain of refused motions leads elsewhere.
+    """Return the initial state at the predicted pose, uncertain by its difference from a chain of refused motions.
 
     Args:
         motion: The last motion of the chain, which agrees with the prediction.
         nav_T_body: (4, 4) pose at the chain's end.
         state: The prediction for the same instant.
-        pose_covariance: (6, 6) of the pose at the beginning of the chain, tangent in body.
-        gravity_covariance: (3, 3) of gravity in nav, or None where it is not estimated.
+        pose_covariance: (6, 6) covariance of the pose at the beginning of the chain, tangent in body.
+        gravity_covariance: (3, 3) covariance of gravity in nav, or None where it is not estimated.
     """
     apart = se3_log(se3_inverse(state.nav_T_body) @ nav_T_body)
     covariance = pose_covariance + motion.covariance + np.diag(apart**2)
@@ -167,13 +168,13 @@ def from_prediction(
 
 
 def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covariance: StateCovariance) -> InitialState:
-    """Reinitialise at the present pose for an IMU that was not used until now.
+    """Return the initial state at the present pose for an IMU that was not used until now.
 
     Args:
-        motion: By vision, that ends in the state.
-        match: How the IMU moves beside vision.
-        state: The newest one.
-        covariance: Of that.
+        motion: A motion by vision that ends in the state.
+        match: Result of the comparison of the IMU with vision.
+        state: The newest state.
+        covariance: Covariance of the newest state.
     """
     state = replace(
         _with_velocity(state, motion),
@@ -188,15 +189,15 @@ def with_new_imu(motion: RelativeMotion, match: ImuMatch, state: RigState, covar
 def with_inertial_state(
     known: InertialState, then: RigState, now_ns: int, now: RigState, blind_s: float, covariance: StateCovariance
 ) -> InitialState:
-    """Reinitialise at the present pose with velocity, biases and gravity that are known from a keyframe.
+    """Return the initial state at the present pose with velocity, biases and gravity that are known from a keyframe.
 
     Args:
-        known: At the keyframe.
-        then: The state at the keyframe, as the estimator has it.
+        known: Velocity, biases and gravity at the keyframe.
+        then: The estimator's state at the keyframe.
         now_ns: Stamp of the newest state.
-        now: That state.
-        blind_s: Time for which vision has not constrained the state: the position goes on with the velocity.
-        covariance: Of the newest state.
+        now: The newest state.
+        blind_s: Time since vision last constrained the state: over it, the position is corrected with the velocity.
+        covariance: Covariance of the newest state.
     """
     since_s = 1e-9 * (now_ns - known.stamp_ns)
     nav_R_then, nav_R_now = then.nav_T_body[:3, :3], now.nav_T_body[:3, :3]
@@ -222,13 +223,13 @@ def with_inertial_state(
 def with_late_imu(
     initial: InitialState, motion: RelativeMotion, state: RigState, covariance: StateCovariance
 ) -> InitialState:
-    """Reinitialise at the present pose for an IMU whose first samples have come only now.
+    """Return the initial state at the present pose for an IMU whose first samples have come only now.
 
     Args:
-        initial: At the same instant by the IMU alone, in a nav frame that is level.
-        motion: By vision, that ends in the state.
-        state: The newest one.
-        covariance: Of that.
+        initial: Initial state at the same instant by the IMU alone, in a nav frame that is level.
+        motion: A motion by vision that ends in the state.
+        state: The newest state.
+        covariance: Covariance of the newest state.
     """
     nav_R_level = state.nav_T_body[:3, :3] @ initial.state.nav_T_body[:3, :3].T
     state = replace(_with_velocity(state, motion), gravity_nav=nav_R_level @ initial.state.gravity_nav)
@@ -241,7 +242,7 @@ def with_late_imu(
 def with_wide_attitude(initial: InitialState) -> InitialState:
     """Return the first state of an epoch with gravity and gyro bias as uncertain as at a first initialisation.
 
-    For a state that is reinitialised soon after the last time: what it would take over is probably wrong.
+    For a state that is reinitialised soon after the last time: the values that it would take over are probably wrong.
     """
     uncertainty = replace(initial.uncertainty, gyro_bias_rad_s=_WIDE_GYRO_BIAS_SIGMA)
     uncertainty = replace(uncertainty, pose=uncertainty.pose + np.diag([_WIDE_TILT_RAD] * 3 + [0.0] * 3) ** 2)
@@ -249,7 +250,7 @@ def with_wide_attitude(initial: InitialState) -> InitialState:
 
 
 def with_uncertain_position(initial: InitialState, sigma_m: float) -> InitialState:
-    """Return an initial state whose position is less certain, by a standard deviation of each coordinate."""
+    """Return the initial state with an additional standard deviation in each coordinate of its position."""
     pose = initial.uncertainty.pose + np.diag([0.0] * 3 + [sigma_m] * 3) ** 2
     return replace(initial, uncertainty=replace(initial.uncertainty, pose=pose))
 
@@ -257,7 +258,7 @@ def with_uncertain_position(initial: InitialState, sigma_m: float) -> InitialSta
 def _at_kept_pose(
     stamp_ns: int, state: RigState, pose_covariance: Float, gravity_covariance: Float | None
 ) -> InitialState:
-    # The pose defines nav from now on: its uncertainty is reported, but nothing is estimated of it.
+    # The pose defines nav from now on: its uncertainty is reported, but not estimated.
     initial = with_free_gravity(_reinitialised(stamp_ns, state, pose_covariance, gravity_covariance))
     return replace(initial, uncertainty=replace(initial.uncertainty, nav_covariance=pose_covariance))
 
@@ -270,7 +271,7 @@ def _reinitialised(
     gyro_bias_sigma: float = _GYRO_BIAS_SIGMA,
 ) -> InitialState:
     # Position and heading must not move when the attitude becomes known better: their uncertainty is reported, but
-    # nothing is estimated of it.
+    # not estimated.
     pose, nav_covariance = as_origin(state.nav_T_body[:3, :3], pose_covariance)
     gravity = np.zeros((3, 3)) if gravity_covariance is None else gravity_covariance
     uncertainty = InitialUncertainty(pose, _REINITIALISED_SPEED_SIGMA, gyro_bias_sigma, nav_covariance, gravity)

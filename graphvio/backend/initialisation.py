@@ -24,10 +24,10 @@ class InitialAttitude:
     """Attitude and gyro bias before vision has measured anything.
 
     Attributes:
-        nav_R_body: (3, 3), gravity down, heading zero.
-        tilt_sigma_rad: of roll and pitch.
+        nav_R_body: (3, 3) attitude, with gravity down and heading zero.
+        tilt_sigma_rad: standard deviation of roll and pitch.
         gyro_bias: (3,) rad/s.
-        gyro_bias_sigma: rad/s.
+        gyro_bias_sigma: standard deviation of each component of the bias, rad/s.
         is_stationary: whether the rig stood still.
     """
 
@@ -42,8 +42,8 @@ def initial_attitude(interval: ImuInterval, at_s: float, config: InitialisationC
     """Estimate the attitude at an instant of an IMU interval, ``at_s`` seconds from its beginning.
 
     At a standstill the mean specific force is gravity and the mean rate is the gyro's bias. In motion, the specific
-    force, turned by the gyro into the instant's frame, still averages to gravity up to the change of speed, whose
-    share falls with the duration; the bias is then left to the smoother.
+    force, rotated by the gyro into the instant's frame, still averages to gravity, up to the change of speed divided by
+    the duration; the estimation of the bias is then left to the smoother.
     """
     duration = float(interval.steps_s.sum())
     mean_force = interval.linear_acceleration.mean(axis=0)
@@ -73,7 +73,7 @@ def initial_attitude(interval: ImuInterval, at_s: float, config: InitialisationC
 
 
 def shows_standstill(interval: ImuInterval, config: InitialisationConfig) -> bool:
-    """Whether an IMU interval shows nothing but gravity and noise; a short one may by chance."""
+    """Whether an IMU interval shows nothing but gravity and noise; a short one may do so by chance, in motion."""
     return bool(
         _spread(interval.angular_velocity) < config.static_gyro_rad_s
         and _spread(interval.linear_acceleration) < config.static_accel_m_s2
@@ -88,9 +88,9 @@ def _spread(samples: Float) -> float:
 
 
 def level(up: Float) -> Float:
-    """Return ``nav_R_body`` (3, 3) that turns a direction (3,) of body upright, with heading zero.
+    """Return ``nav_R_body`` (3, 3) that rotates a direction (3,) in body to nav's z axis, with heading zero.
 
-    Heading is that of body's x axis, or where x is steep, of its z axis.
+    The heading is that of body's x axis, or of its z axis where x is steep.
     """
     up = up / np.linalg.norm(up)
     forward = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < _STEEP else np.array([0.0, 0.0, 1.0])

@@ -18,10 +18,10 @@ _SINGULAR = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """The joint distribution of some variables: their step x from the present values has ``R x = d``.
+    """The joint Gaussian distribution of some variables, whose step x from their present values has ``R x = d``.
 
     Attributes:
-        columns: Columns of each variable.
+        columns: Key of a variable -> its columns of R.
         square_root: R (N, N), upper triangle; ``R^T R`` is the information.
         right_side: d (N,), zero where the present values are the solution.
     """
@@ -31,7 +31,7 @@ class Marginal:
     right_side: Float
 
     def covariance(self, keys: Sequence[int]) -> Float | None:
-        """Return the covariance of some of the variables, in the order given, or None if it is not bounded.
+        """Return the covariance of some of the variables, in the order given, or None if it is unbounded.
 
         R is inverted instead of the information, for its better condition.
         """
@@ -59,15 +59,15 @@ class Marginal:
     def extended(
         self, factors: Sequence[gtsam.GaussianFactor], last: Sequence[int], dims: Mapping[int, int]
     ) -> Marginal | None:
-        """Return the joint distribution with more factors and their variables.
+        """Return the joint distribution after factors and their variables have been added.
 
         Args:
-            factors: Linearised at the present values.
-            last: Variables that are ordered last.
-            dims: Dimensions of all variables.
+            factors: The factors, linearised at the present values.
+            last: Keys of the variables that are ordered last.
+            dims: Key -> dimension, of all variables.
 
         Returns:
-            None where some variable is not constrained.
+            The distribution, or None where some variable is not constrained.
         """
         new = frozenset(key for factor in factors for key in list(factor.keys())) - self.columns.keys()
         keys = [key for key in (*self.columns, *sorted(new)) if key not in last]
@@ -100,15 +100,15 @@ class Marginal:
 def marginal_of_last(
     solution: gtsam.GaussianBayesTree, last: Sequence[int], dims: Mapping[int, int]
 ) -> Marginal | None:
-    """Return the marginal of the variables that were eliminated last, or None if some are not in a root.
+    """Return the marginal of the variables that were eliminated last, or None if some are not in a root clique.
 
-    As a rule all states are tied to each other, and they are the lower corner of the one root; just after a start there
-    may be several.
+    As a rule all states are connected, and these variables are the lower corner of the only root; just after a start
+    there may be several roots.
 
     Args:
-        solution: of the linearised window.
-        last: variables.
-        dims: Dimensions of all variables.
+        solution: Bayes tree of the linearised window.
+        last: Keys of the variables.
+        dims: Key -> dimension, of all variables.
     """
     conditionals = [root.conditional() for root in solution.roots()]
     ends = [list(takewhile(frozenset(last).__contains__, reversed(list(each.keys())))) for each in conditionals]
@@ -127,12 +127,12 @@ def marginal_of_last(
 
 @cache
 def _upper(size: int) -> Float:
-    """Ones on and above the diagonal (size, size); `numpy.triu` would make them each time."""
+    """Return ones on and above the diagonal (size, size), made once; `numpy.triu` would make them in each call."""
     return np.triu(np.ones((size, size)))
 
 
 def _columns(keys: Iterable[int], dims: Mapping[int, int]) -> tuple[dict[int, slice], int]:
-    """Where variables stand in a matrix that has them side by side, and how wide it is."""
+    """Return the columns of variables that stand side by side in a matrix, and the number of columns."""
     columns, size = {}, 0
     for key in keys:
         columns[key] = slice(size, size + dims[key])

@@ -10,7 +10,7 @@ from graphvio.backend.gating import chi_square_quantile
 from graphvio.kernels import kernel
 from graphvio.linear_algebra import cholesky, eigen, product, solve_lower
 
-_MIN_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
+_MIN_OWN_SHARE = 0.001  # of a motion's covariance in each direction: keeps it positive definite
 
 
 def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
@@ -23,7 +23,7 @@ def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
 
 
 def robust(noise: gtsam.noiseModel.Gaussian, probability: float) -> gtsam.noiseModel.Base:
-    """Return the noise with Huber's kernel, linear beyond this quantile of the chi-square distribution."""
+    """Return the noise with Huber's kernel, linear beyond the chi-square quantile of ``probability``; 1 disables it."""
     if probability == 1.0:
         return noise
     distance = np.sqrt(chi_square_quantile(probability, noise.dim()))
@@ -37,9 +37,9 @@ def isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
 
 @kernel
 def own_covariance(covariance: Float, shared: Float) -> Float:
-    """Return what a motion's covariance (6, 6) has beyond the part (6, 6) that it shares with other motions.
+    """Return a motion's covariance (6, 6) without the part (6, 6) that it shares with other motions.
 
-    The shared part may exceed the covariance a little as the rig moves on: a minimum is always the motion's own.
+    As the rig moves on, the shared part may exceed the covariance a little: a minimum share of the covariance remains.
     """
     root = cholesky(covariance)
     white = solve_lower(root, solve_lower(root, shared).T)

@@ -1,4 +1,4 @@
-"""The IMU between two framesets as one measurement of the motion between them.
+"""Preintegration of the IMU between two framesets into one measurement of the motion between them.
 
 C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial
 Odometry*, IEEE T-RO 33(1), 2017; in gtsam's form with the biases' random walks.
@@ -17,8 +17,8 @@ from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
-_INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
-_MIN_STAMP_SIGMA_S = 1e-4  # of stamps that jitter
+_INTEGRATION_SIGMA = 3e-5  # like a noise in m/s^2: the error of integrating piecewise constant rates
+_MIN_STAMP_SIGMA_S = 1e-4  # stamps with a larger sigma count as jittering
 
 
 def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
@@ -33,7 +33,7 @@ def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationC
 
 
 def is_as_stated(interval: ImuInterval, imu: Imu, noise_scale: float) -> bool:
-    """Return whether samples show no more than the stated noise, and the stamps of framesets do not jitter."""
+    """Return whether the samples show no more than the rig file's noise, and the framesets' stamps do not jitter."""
     is_more = interval.noise_densities > noise_scale * imu.noise_densities
     return interval.stamp_sigma_s < _MIN_STAMP_SIGMA_S and not is_more.any()
 
@@ -41,17 +41,17 @@ def is_as_stated(interval: ImuInterval, imu: Imu, noise_scale: float) -> bool:
 def interval_params(
     interval: ImuInterval, imu: Imu, noise_scale: float, state: RigState
 ) -> gtsam.PreintegrationCombinedParams:
-    """Return gtsam's parameters for an interval, by the noise that its samples show and the jitter of its stamps.
+    """Return gtsam's parameters for an interval, with the noise that its samples show and the jitter of its stamps.
 
     Args:
-        interval: to be preintegrated.
-        imu: the rig's.
-        noise_scale: factor on its noise densities, which hold where the samples show less.
-        state: at the interval's beginning.
+        interval: the interval to be preintegrated.
+        imu: the rig's IMU.
+        noise_scale: factor on the IMU's noise densities, which are used where the samples show less noise.
+        state: the state at the interval's beginning.
     """
     params, dt = preintegration_params(imu, noise_scale), float(interval.steps_s.sum())
     gyro, accel = np.maximum(noise_scale * imu.noise_densities, interval.noise_densities)
-    # In an interval that is longer than the stamps say, the rig turns, speeds up and moves on; as white noise.
+    # If an interval is longer than its stamps say, the rig turns, speeds up and moves on in it; taken as white noise.
     longer2 = 2.0 * interval.stamp_sigma_s**2 / dt
     turn2 = longer2 * float(np.sum((interval.mean_rate - state.gyro_bias) ** 2))
     faster2 = longer2 * float((np.linalg.norm(interval.mean_force) - GRAVITY_M_S2) ** 2)
@@ -67,8 +67,8 @@ def preintegrate(
 ) -> gtsam.PreintegratedCombinedMeasurements:
     """Preintegrate an interval, linearised at a bias.
 
-    A step's mean force is that of its middle, while gtsam takes it in the frame at the step's beginning: it is turned
-    there by half of the step's rotation.
+    A step's mean force is in the body frame at its middle, while gtsam expects it in the frame at the step's beginning:
+    it is rotated to there by half of the step's rotation.
     """
     measurements = gtsam.PreintegratedCombinedMeasurements(params, bias)
     forces = _at_start(interval.steps_s, interval.angular_velocity, interval.linear_acceleration, bias.vector())

@@ -17,7 +17,7 @@ from graphvio.geometry import multiply, rotate, se3, se3_compose, se3_exp, so3_e
 from graphvio.kernels import kernel
 from graphvio.measurements.estimate import Prediction
 
-_MAX_BLIND_NS = 5_000_000_000  # without a frameset
+_MAX_BLIND_NS = 5_000_000_000  # longest propagation by the IMU without a frameset
 
 
 class Propagator:
@@ -44,9 +44,9 @@ class Propagator:
             stamp_ns: Stamp of the state.
             state: The rig at that instant.
             epoch: Epoch of the state.
-            rate: (3,) rad/s of body. Without samples, it and the velocity in body are taken to be constant.
-            stamps: (N,) of the IMU samples on the framesets' clock; the first is the state's, or there are none.
-            values: (N, 6) of the samples: angular velocity and specific force.
+            rate: (3,) angular rate of body, rad/s. Without samples, it and the velocity in body are assumed constant.
+            stamps: (N,) stamps of the IMU samples on the framesets' clock; the first is the state's, or there are none.
+            values: (N, 6) values of the samples: angular velocity and specific force.
         """
         path = _Path(stamp_ns, state, epoch, rate, values[0] if len(values) else None)
         for stamp, sample in zip(stamps[1:].tolist(), values[1:], strict=True):
@@ -56,18 +56,18 @@ class Propagator:
         self._path = path
 
     def add(self, stamp_ns: int, sample: Float) -> bool:
-        """Add an IMU sample (6,), and return whether it is newer than the others and can be predicted from."""
+        """Add an IMU sample (6,), and return whether it extends the path: it is newer, without too long a gap."""
         path = self._path
         if path is None or not path.samples or stamp_ns <= path.stamps[-1]:
             return False
         if stamp_ns - path.stamps[-1] > self._max_gap_ns or stamp_ns - path.stamps[0] > _MAX_BLIND_NS:
-            self._path = None  # what happened in a gap is not known, nor where an IMU alone would be by now
+            self._path = None  # the motion in a gap is unknown, and an IMU alone drifts too far
             return False
         path.add(stamp_ns, sample)
         return True
 
     def predict(self, stamp_ns: int) -> Prediction | None:
-        """Return the prediction at an instant, or None where there is none."""
+        """Return the prediction at an instant, or None if none is possible."""
         path = self._path
         return None if path is None else path.predict(stamp_ns, self._longest_ns)
 
@@ -75,7 +75,7 @@ class Propagator:
 class _Path:
     """A state and its propagation by the IMU samples since then; without an IMU there are no samples.
 
-    Stamps are appended last, so that a reader in another thread finds all that belongs to a stamp.
+    Stamps are appended last, so that a reader in another thread finds everything that belongs to a stamp.
     """
 
     def __init__(self, stamp_ns: int, state: RigState, epoch: int, rate: Float, sample: Float | None) -> None:
@@ -94,7 +94,7 @@ class _Path:
         self.stamps.append(stamp_ns)
 
     def _propagate(self, end: int) -> None:
-        """Propagate up to a sample."""
+        """Propagate poses and velocities up to sample ``end``."""
         with self._growing:
             for i in range(len(self.poses), end + 1):
                 mean = 0.5 * (self.samples[i - 1] + self.samples[i])
@@ -106,7 +106,7 @@ class _Path:
         """Return the state at an instant, at most ``longest_ns`` after the newest sample, or None."""
         i = bisect_right(self.stamps, stamp_ns) - 1
         if i < 0:
-            return None  # an estimate is newer
+            return None  # the state that the path begins with is newer
         is_newest = i == len(self.stamps) - 1
         after_ns = stamp_ns - self.stamps[i]
         if is_newest and after_ns > longest_ns:
@@ -130,9 +130,9 @@ class _Path:
 def advanced(
     nav_T_body: Float, velocity_nav: Float, mean: Float, bias: Float, gravity_nav: Float, duration_s: float
 ) -> tuple[Float, Float]:
-    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), and biases (6,).
+    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), less biases (6,).
 
-    The mean force is that of the step's middle, and so is the attitude that turns it.
+    The mean force is taken as the force at the middle of the step, and rotated by the attitude there.
     """
     turn = duration_s * (mean[:3] - bias[:3])
     half_turned = multiply(nav_T_body, so3_exp(0.5 * turn))

@@ -1,6 +1,6 @@
-"""Motions by rolling shutters, which depend on the velocities by which their lines were compensated.
+"""Factor of a motion measured with rolling shutters, which depends on the velocities that compensated the image lines.
 
-The velocity that was predicted when a frameset was compensated is not that of the solution: the factor of its motion
+A frameset is compensated with a predicted velocity, which differs from that of the solution: the factor of its motion
 takes the difference into account, and so does the innovation test. Without that, an error of the velocity makes the
 next motion wrong, which makes the velocity more wrong.
 """
@@ -21,11 +21,11 @@ def readout_factor(
     """Return the factor of a motion that depends on velocities.
 
     Args:
-        reference: Key of the pose that it is measured from.
-        newest: Key of the pose that it leads to.
+        reference: Key of the pose from which the motion is measured.
+        newest: Key of the pose at which the motion ends.
         velocities: Keys of the velocities in nav, of the newest state and of the reference.
-        motion: With ``by_velocities``.
-        noise: Of the motion.
+        motion: The motion, with ``by_velocities``.
+        noise: Noise of the motion.
     """
     by_velocities = motion.by_velocities
     assert by_velocities is not None
@@ -45,13 +45,13 @@ def readout_factor(
 
 
 def jacobians_of(relative: Float, by_velocities: ByVelocities, nav_R_body: Float, in_body: Float) -> list[Float]:
-    """Return the derivatives of a motion's error, for small errors.
+    """Return the Jacobians of the error of a `readout_factor`, for small errors.
 
     Args:
-        relative: (4, 4) from the reference to the newest state.
-        by_velocities: Of the motion.
-        nav_R_body: (2, 3, 3) of the newest state and of the reference.
-        in_body: (2, 3) m/s, velocities likewise.
+        relative: (4, 4) motion from the reference to the newest state.
+        by_velocities: Dependence of the motion on the velocities.
+        nav_R_body: (2, 3, 3) attitudes of the newest state and of the reference.
+        in_body: (2, 3) velocities in body, in the same order, m/s.
 
     Returns:
         (6, 6), (6, 6), (6, 3) and (6, 3) with respect to the poses of reference and newest state, and to the velocities
@@ -65,10 +65,10 @@ def jacobians_of(relative: Float, by_velocities: ByVelocities, nav_R_body: Float
 
 
 def corrected(motion: RelativeMotion, by_velocities: ByVelocities, in_body: Float) -> Float:
-    """Return a motion (4, 4) as velocities (2, 3) m/s in body, now and at the reference, would have it."""
+    """Return a motion (4, 4) corrected for the velocities (2, 3) in body, now and at the reference, m/s."""
     return np.asarray(motion.reference_T_current @ se3_exp(-_excess(by_velocities, in_body)))
 
 
 def _excess(by_velocities: ByVelocities, in_body: Float) -> Float:
-    """Return by how much a motion (6,) was measured too long, if the velocities are these."""
+    """Return the error (6,) of a motion that was compensated with other velocities in body than these (2, 3)."""
     return np.asarray(np.einsum("kij,kj->i", by_velocities.derivatives, in_body - by_velocities.used))

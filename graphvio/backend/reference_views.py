@@ -1,4 +1,4 @@
-"""Reference states as vision sees them, with the error that all motions from one reference share."""
+"""Nuisance poses of reference states, which model the error that all motions from one reference share."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ReferenceViews:
 
     def __init__(self) -> None:
         self._shared: dict[int, Float] = {}  # state -> covariance (6, 6) of its view about its pose, in body there
-        self._own: tuple[RelativeMotion, Float] | None = None  # of the motion asked for last
+        self._own: tuple[RelativeMotion, Float] | None = None  # the motion asked for last, and its own covariance
 
     def add(self, k: int, motion: RelativeMotion, window: Holder) -> None:
         """Insert the nuisance variable of a motion's reference, state k, if it needs one and has none."""
@@ -48,10 +48,10 @@ class ReferenceViews:
         return [x(k), r(k)] if k in self._shared else [x(k)]
 
     def seen(self, k: int, motion: RelativeMotion) -> tuple[int, Float]:
-        """Return the key that a motion from state k is measured from, and the motion's covariance (6, 6) from there."""
+        """Return the key of the pose that a motion from state k is measured from, and its covariance (6, 6) there."""
         if k not in self._shared or not motion.shared_covariance.any():
             return x(k), motion.covariance
-        if self._own is None or self._own[0] is not motion:  # it is asked for by the test, and again to insert it
+        if self._own is None or self._own[0] is not motion:  # the gate asks for it, and the insertion again
             adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
             self._own = motion, own_covariance(motion.covariance, np.asarray(adjoint @ self._shared[k] @ adjoint.T))
         return r(k), self._own[1]

@@ -12,9 +12,9 @@ class RefusedMotions:
     """A chain of refused motions with the poses that it leads to, until one passes the gate.
 
     Attributes:
-        nav_T_body: Stamp -> (4, 4) pose by the motions.
-        is_after_gap: Whether the chain begins at a state that the IMU alone has led to.
-        has_imu_failed: Whether samples were missing after the first of them.
+        nav_T_body: Stamp -> pose (4, 4) at which a motion ends.
+        is_after_gap: Whether the chain begins at a state that was predicted by the IMU alone.
+        has_imu_failed: Whether IMU samples were missing after the first refused motion.
         is_distrusted: Whether the calibration of the IMU, or the initial state, proved to be wrong meanwhile.
     """
 
@@ -27,14 +27,14 @@ class RefusedMotions:
 
     @property
     def first_ns(self) -> int:
-        """Stamp at which the first one ends."""
+        """Stamp at which the first motion ends."""
         return min(self.nav_T_body)
 
     def add(self, motion: RelativeMotion, pose: Callable[[int], Float], tracked_ns: int) -> None:
-        """Add a motion from a state, or from the pose that earlier ones lead to.
+        """Add a motion from a state of the window, or from the pose at which an earlier motion of the chain ends.
 
         Args:
-            motion: Of which the reference is in the window.
+            motion: The refused motion; its reference is in the window or in the chain.
             pose: Returns ``nav_T_body`` (4, 4) of a state of the window.
             tracked_ns: Stamp of the last state that vision constrains.
         """
@@ -47,11 +47,11 @@ class RefusedMotions:
         self.nav_T_body[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
 
     def note_missing_imu(self) -> None:
-        """Record that samples are missing, which matters once a motion has been refused."""
+        """Record that IMU samples are missing, if a motion has been refused."""
         self.has_imu_failed |= bool(self.nav_T_body)
 
     def distrust_prediction(self) -> None:
-        """Mark the prediction as wrong, if there is a refused motion to say so."""
+        """Mark the prediction as wrong, if it has refused a motion."""
         self.is_distrusted = bool(self.nav_T_body)
 
     def clear(self) -> None:

@@ -43,7 +43,7 @@ from graphvio.measurements.motion import ByVelocities, RelativeMotion
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
+_RESET_SIGMA_M = 1e-3  # the position's own standard deviation after a reset
 _POSE_AND_GRAVITY = np.r_[0:6, 15:18]
 _MAX_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
 
@@ -70,7 +70,7 @@ class Smoother:
         self._step_s = 0.0  # between the two newest states
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._seen_ns: int | None = None  # the same, by vision
-        self._nav_covariance = np.zeros((6, 6))  # of nav itself, left of its poses: reported, but not estimated
+        self._nav_covariance = np.zeros((6, 6))  # of nav itself, as a left perturbation: only reported
         self._has_rolling_shutter = False  # motions depend on the velocities of their references
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
 
@@ -104,9 +104,9 @@ class Smoother:
                 self._window.add(factor)
 
     def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
-        """Predict the next state and append it: by the IMU, or without an interval of it by constant velocity."""
+        """Predict the next state, by the IMU or without an interval by constant velocity, and append it."""
         i = self._index_of[self.latest_ns]
-        # Stamps of two cameras' clocks may be farther apart, or less, than their images.
+        # Stamps by two cameras' clocks may differ by more, or less, than the instants of their images.
         dt = self._step_s = 1e-9 * (stamp_ns - self.latest_ns if interval is None else interval.duration_ns)
         before = self.state()
         if interval is None or self._imu is None or self._params is None:
@@ -121,7 +121,7 @@ class Smoother:
             params = interval_params(interval, self._imu, noise_scale, before)
         measurements = preintegrate(interval, params, bias)
         predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
-        beyond = before.gravity_nav - level_gravity()  # which gtsam predicts with
+        beyond = before.gravity_nav - level_gravity()  # gtsam predicts with level gravity
         pose = predicted.pose().matrix()
         pose[:3, 3] += 0.5 * dt**2 * beyond
         state = replace(before, nav_T_body=pose, velocity_nav=np.asarray(predicted.velocity()) + dt * beyond)
@@ -133,7 +133,7 @@ class Smoother:
         return state
 
     def knows(self, stamp_ns: int) -> bool:
-        """Whether there is a state of this stamp in the window."""
+        """Whether there is a state with this stamp in the window."""
         return stamp_ns in self._index_of
 
     def pose(self, stamp_ns: int) -> Float:
@@ -191,7 +191,7 @@ class Smoother:
         """Test the innovation of a motion that ends in the newest state against the window's prediction.
 
         Args:
-            motion: By vision.
+            motion: A motion by vision.
             sigma_scale: Factor on the standard deviations of the prediction.
         """
         newest = x(self._index_of[motion.stamp_ns])
@@ -209,9 +209,9 @@ class Smoother:
     def _with_velocities(
         self, motion: RelativeMotion, by_velocities: ByVelocities, reference: int, predicted: Float
     ) -> tuple[Float, Float]:
-        """Return a motion by the window's velocities (4, 4), and the covariance (6, 6) of what the window predicts.
+        """Return a motion (4, 4) corrected for the window's velocities, and the covariance (6, 6) of its prediction.
 
-        The predicted motion (4, 4) is from the pose with the key ``reference``.
+        The predicted motion (4, 4) begins at the pose with the key ``reference``.
         """
         states = [self.state(motion.stamp_ns), self.state(motion.reference_stamp_ns)]
         nav_R_body = np.array([state.nav_T_body[:3, :3] for state in states])
@@ -232,9 +232,9 @@ class Smoother:
         self._window.add(zero_velocity(self._index_of[self.latest_ns]))
 
     def excess_acceleration(self, motion: RelativeMotion) -> float | None:
-        """Return the acceleration, m/s^2, that a motion asks for over the newest step, if the rig cannot have it.
+        """Return the acceleration, m/s^2, that a motion implies over the newest step, if it exceeds the rig's limit.
 
-        None where it can, or vision did not constrain the state before that step.
+        None where it does not, or where vision did not constrain the state before that step.
         """
         if len(self._stamps) < 2 or self._seen_ns != self._stamps[-2]:
             return None
@@ -245,7 +245,7 @@ class Smoother:
         return excess(accel, motion.covariance[3:, 3:] / dt**4, self._config.max_accel_m_s2)
 
     def reset_position(self) -> None:
-        """Reset the position's uncertainty up to its correlation with velocity, attitude and biases (section 5).
+        """Reset the position's uncertainty, except for its correlation with velocity, attitude and biases (section 5).
 
         The position's own uncertainty grows without bound, and no later measurement reduces it. It remains part of what
         `covariance` returns.
@@ -263,7 +263,7 @@ class Smoother:
         return GraphWindow(min_iterations=1 if self._config.huber_probability == 1.0 else 2)
 
     def _with_nav(self, covariance: Float) -> Float:
-        """Add the covariance of nav to that of the newest pose (6, 6), in body."""
+        """Return the covariance (6, 6) of the newest pose, in body, with that of nav added to it."""
         from_nav = se3_adjoint(se3_inverse(self.pose(self.latest_ns)))
         return np.asarray(covariance + from_nav @ self._nav_covariance @ from_nav.T)
 
@@ -288,10 +288,10 @@ class Smoother:
             self._window.add(readout_factor(reference, x(newest), (v(newest), v(k)), motion, noise))
 
     def update(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
-        """Update the newest states by the newest factors.
+        """Update the newest states with the newest factors.
 
-        Every third time, or where they change by much, the window is optimised as a whole, and what is older than the
-        lag is marginalised.
+        Every third time, or where they change much, the window is optimised as a whole, and the states that are older
+        than the lag are marginalised.
 
         Args:
             keep: stamps of states that stay in the window, and whose covariance will be asked for.
@@ -339,11 +339,11 @@ class Smoother:
         if self.has_imu:
             values.insert(v(k), state.velocity_nav)
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-            values.insert_or_assign(b(k), bias)  # `insert` looks for the type among more, and takes twice as long
+            values.insert_or_assign(b(k), bias)  # `insert` has more types to try, and takes twice as long
         return k
 
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
-        """Tie two states by constant velocity and angular rate, eq. (11) and (12)."""
+        """Insert factors of constant velocity and angular rate between two states, eq. (11) and (12)."""
         config = self._config
         after_s = (self.latest_ns - self._constrained_ns) * 1e-9
         accelerations = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
@@ -355,7 +355,7 @@ class Smoother:
                 self._window.add(factor)
 
     def _retained(self, keep: frozenset[int]) -> list[int]:
-        """Return the variables that the next factors will be tied to, or whose covariance will be needed."""
+        """Return the variables that the next factors will involve, or whose covariance will be needed."""
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
         keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]
         if self._has_rolling_shutter:

@@ -40,15 +40,15 @@ from graphvio.measurements.inertial_state import InertialState
 from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
-_MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
-_MAX_MOTIONS_OF_A_STANDSTILL = 20  # then a standstill that was assumed is believed
-_MIN_AGAINST_STANDSTILL = 3  # refused motions, soon after an initialisation at a standstill, if the first is weak
-_MIN_GAP_S = 0.5  # without a motion by vision, over which an IMU whose file is wrong leads velocity and tilt off
-_MIN_AFTER_GAP = 2  # good motions that are refused then, after which they are believed
-_MAX_TILT_RATIO = 2.0  # of sigmas: those of a state that a wrong calibration has led are too small
-_MIN_OFF2 = 21.0  # squared Mahalanobis distance of a state, of 12 dimensions, that is not kept: 5 % exceed it by chance
-_MAX_PARTIAL_STATISTIC = 25.0  # squared Mahalanobis distance, of up to 6 dimensions: chance exceeds it once in 3000
-_CONSTANT_VELOCITY_SCALE = 3.0  # of its sigmas, for the gate: fast hand-held cameras often leave it
+_MIN_TRUSTED_MOTIONS = 20  # after fewer motions, the attitude of a lost state is not taken over
+_MAX_MOTIONS_OF_A_STANDSTILL = 20  # accepted ones after which an assumed standstill is certain
+_MIN_AGAINST_STANDSTILL = 3  # refused motions that disprove an assumed standstill, if the first is weak
+_MIN_GAP_S = 0.5  # longer gaps of vision let an IMU with a wrong rig file spoil velocity and tilt
+_MIN_AFTER_GAP = 2  # refused good motions after such a gap, from which on they are used
+_MAX_TILT_RATIO = 2.0  # ratio of sigmas: a state with a wrong calibration has too small ones
+_MIN_OFF2 = 21.0  # squared Mahalanobis distance (12 dimensions) of a state that is replaced: 5 % exceed it by chance
+_MAX_PARTIAL_STATISTIC = 25.0  # squared Mahalanobis distance (up to 6 dimensions): once in 3000 by chance
+_CONSTANT_VELOCITY_SCALE = 3.0  # factor on its sigmas in the gate: fast hand-held cameras often violate it
 
 
 class SmootherEstimator:
@@ -75,15 +75,15 @@ class SmootherEstimator:
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._accepted = 0  # motions since the initialisation
         self._refused = RefusedMotions()
-        self._are_points_wrong = False  # the few ones of partial motions, since the last good motion
-        self._is_predicted_by_imu = False  # the newest state
+        self._are_points_wrong = False  # whether points of partial motions were, since the last good motion
+        self._is_predicted_by_imu = False  # whether the newest state is
         self._is_imu_left_out = False
-        self._is_standstill_assumed = False  # by the IMU alone, which does not see a steady motion
-        self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
-        self._sigma_m = 0.0  # of the position since vision last constrained it
-        self._rebuilt_sigma_m = 0.0  # the same when the window was rebuilt since then
-        self._kept_ns: frozenset[int] = frozenset()  # states that motions are asked for from
-        self._carried: dict[int, tuple[Float, Float]] = {}  # motions since those that have been discarded
+        self._is_standstill_assumed = False  # from the IMU alone, which cannot show a steady motion
+        self._tracked_covariance = np.zeros((6, 6))  # covariance of the last pose that vision constrains
+        self._sigma_m = 0.0  # sigma of the position since vision last constrained it
+        self._rebuilt_sigma_m = 0.0  # the same at a rebuild of the window since then, or zero
+        self._kept_ns: frozenset[int] = frozenset()  # stamps of states from which motions are asked for
+        self._carried: dict[int, tuple[Float, Float]] = {}  # motions since states that were discarded
         self._final: list[tuple[int, Float]] = []
 
     @property
@@ -122,7 +122,7 @@ class SmootherEstimator:
         return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
 
     def covariance_since(self, then_ns: int) -> Float | None:
-        """Return the joint posterior's covariance (6, 6) of that motion, or None if the window has none."""
+        """Return the joint posterior's covariance (6, 6) of `motion_since`, or None if the window has none."""
         smoother = self._smoother
         if smoother is None or not smoother.knows(then_ns):
             return self._carried[then_ns][1] if then_ns in self._carried else None
@@ -151,7 +151,7 @@ class SmootherEstimator:
         """Do nothing: the intervals between framesets have the samples."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
-        """Make a smoother with one state."""
+        """Create a smoother with one state."""
         if self._rig.imu is not None and imu is None:
             self._status.report_no_imu(stamp_ns)
         self._smoother = Smoother(self._config.smoother, self._rig.imu if imu else None)
@@ -177,7 +177,7 @@ class SmootherEstimator:
         return False
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
-        """Gate the relative motion and the zero velocity, and insert what passes into the window."""
+        """Gate the relative motion and the zero velocity, and insert those that pass into the window."""
         try:
             update = self._apply_motion(visual)
             if is_stationary and self.has_imu:
@@ -188,7 +188,7 @@ class SmootherEstimator:
         return update
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
-        """Optimise the window and marginalise; one without a solution is rebuilt around the prediction."""
+        """Optimise the window and marginalise; a window without a solution is rebuilt around the prediction."""
         smoother, is_rebuilt = self._running, False
         self._kept_ns = keep
         if is_constrained:
@@ -218,18 +218,18 @@ class SmootherEstimator:
         return StateUpdate(status, needs_keyframe=is_rebuilt)
 
     def leave_imu_out(self) -> None:
-        """Stop waiting for the IMU until `use_imu_again`: the initialisation no longer needs what it would show."""
+        """Stop waiting for the IMU until `use_imu_again`: the initialisation needs no tilt and velocity from it."""
         self._is_imu_left_out = True
 
     def pose_by_vision(self) -> Float:
-        """Return ``nav_T_body`` (4, 4) of the newest state, by motions where they have been refused until then."""
+        """Return ``nav_T_body`` (4, 4) of the newest state; while motions are refused, the pose that these lead to."""
         return self._refused.nav_T_body.get(self.latest_ns, self.state().nav_T_body)
 
     def distrust_prediction(self) -> None:
         """Mark the prediction as wrong, after an error of the IMU's calibration, if motions are being refused.
 
-        The next motion of good quality then resets the state. Unlike when motions are refused for too long, biases and
-        attitude become uncertain, as they have followed wrong samples.
+        The next motion of good quality then resets the state. Gyro bias and attitude become uncertain, as they have
+        followed wrong samples; when motions are only refused for too long, roll and pitch do not.
         """
         self._refused.distrust_prediction()
 
@@ -237,8 +237,8 @@ class SmootherEstimator:
         """Use the IMU again after it was left out: keep the newest pose, and reset velocity, biases and gravity.
 
         Args:
-            motion: By vision, that ends in the newest state.
-            match: How the IMU moves beside vision; has the gyro bias and gravity.
+            motion: A motion by vision that ends in the newest state.
+            match: Result of the comparison of the IMU with vision; has the gyro bias and gravity.
         """
         self._is_imu_left_out = False
         try:
@@ -249,10 +249,10 @@ class SmootherEstimator:
             self._rebuild(self.latest_ns, self.state(), error)
 
     def use_inertial_state(self, known: InertialState) -> bool:
-        """Go on with velocity, biases and gravity from a keyframe of the window that contradicts the state's.
+        """Replace velocity, biases and gravity by those known at a keyframe of the window, if the two disagree.
 
-        They must be about as well known: their tilt by at most twice the standard deviation. A state that agrees with
-        them stays as it is, since a new one ends the keyframe.
+        The keyframe's values must be about as well known: the standard deviation of their tilt is below twice that of
+        the state. A state that agrees with them stays as it is, since a new window ends the keyframe.
 
         Returns:
             Whether the state was replaced.
@@ -270,7 +270,7 @@ class SmootherEstimator:
             off2 = known.distance2(
                 body_R_nav @ then.velocity_nav, then.accel_bias, then.gyro_bias, body_R_nav @ then.gravity_nav
             )
-            if off2 < _MIN_OFF2:  # both have seen the same: nothing is gained
+            if off2 < _MIN_OFF2:  # they agree: nothing would be gained
                 return False
             blind_s = 1e-9 * (smoother.latest_ns - self._tracked_ns)
             initial = with_inertial_state(known, then, smoother.latest_ns, now, blind_s, covariance)
@@ -284,7 +284,7 @@ class SmootherEstimator:
         return True
 
     def _carry_motions(self, nav_T_newest: Float) -> None:
-        """Keep the motions since the references and the last keyframe, until the next prediction."""
+        """Keep the motions from the references and the last keyframe to the newest state, until the next prediction."""
         motions = {}
         for then_ns in self._kept_ns:
             covariance = self.covariance_since(then_ns)
@@ -293,11 +293,11 @@ class SmootherEstimator:
         self._carried = motions
 
     def use_late_imu(self, motion: RelativeMotion, imu: tuple[ImuInterval, float]) -> None:
-        """Use the IMU from now on, after an initialisation without: keep the newest pose, and take gravity from it.
+        """Use the IMU from now on, after an initialisation without it: keep the newest pose, and take gravity from it.
 
         Args:
-            motion: By vision, that ends in the newest state.
-            imu: The IMU around the state and the state's place in that interval, seconds.
+            motion: A motion by vision that ends in the newest state.
+            imu: The IMU readings around the state, and the state's time in that interval, seconds.
         """
         stamp_ns, state = self.latest_ns, self.state()
         first = first_state_at(stamp_ns, np.zeros(3), imu, self._rig, self._config.initialisation)
@@ -313,14 +313,14 @@ class SmootherEstimator:
     # ------------------------------------------------------------------ measurement update
 
     def _apply_motion(self, visual: VisualResult) -> MeasurementUpdate:
-        """Insert the motion if it passes the gate; reinitialise after lost, or once it was refused for too long."""
+        """Insert the motion if it passes the gate; reinitialise after lost, or after refusing for too long."""
         smoother, motion = self._running, visual.motion
         if motion is None:
             return self._apply_partial_motion(visual.partial_motion)
         if not smoother.knows(motion.reference_stamp_ns):  # the state was reinitialised since then
             return MeasurementUpdate(None, needs_keyframe=True)
         if self._status.is_lost and (motion.reference_stamp_ns > self._tracked_ns or self._rebuilt_sigma_m):
-            # It is not from a state that was known.
+            # The motion begins at a state that vision did not constrain.
             self._reinitialise_after_lost(motion)
             return MeasurementUpdate(motion, needs_keyframe=True)
         motion, gate_result = self._contradiction.resolve(visual, self._running.gate, self.has_imu)
@@ -335,14 +335,14 @@ class SmootherEstimator:
         why = gate_result.exceedance if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
         if visual.quality is not Quality.GOOD and not self._may_be_moving:
-            # Vision that contradicts itself cannot refute the prediction, but for a standstill that is only assumed.
+            # Weak vision cannot refute the prediction, except that of a standstill that was only assumed.
             return MeasurementUpdate(None)
         return self._refuse(motion, visual.quality)
 
     def _apply_partial_motion(self, motion: RelativeMotion | None) -> MeasurementUpdate:
-        """Let few points correct the state that the IMU predicts, if they pass the gate; vision fails all the same.
+        """Correct the state that the IMU predicts by the motion of a few points, if it passes the gate.
 
-        Where they are not used, the keyframe need not go on.
+        The frameset still counts as one without vision. Where the motion is not used, a new keyframe is asked for.
         """
         if motion is None:
             return MeasurementUpdate(None)
@@ -351,7 +351,7 @@ class SmootherEstimator:
         )
         if not is_predicted or not self._running.knows(motion.reference_stamp_ns):
             return MeasurementUpdate(None, needs_keyframe=True)
-        # Few points may all be on somebody who walks by.
+        # A few points may all be on a person who walks by.
         self._are_points_wrong |= not self._running.gate(motion).statistic <= _MAX_PARTIAL_STATISTIC
         if self._are_points_wrong:
             return MeasurementUpdate(None, needs_keyframe=True)
@@ -365,7 +365,7 @@ class SmootherEstimator:
             self._accepted += 1
             self._note_accepted()
             return MeasurementUpdate(motion)
-        # It agrees with the prediction only because both start from a state that vision did not constrain.
+        # The motion agrees with the prediction only because both start from a state that vision did not constrain.
         self._refused.add(motion, self._running.pose, self._tracked_ns)
         if self._refused.is_distrusted or self._refused.has_imu_failed:
             self._reinitialise_from_vision(motion, "the IMU failed while vision was refused")
@@ -374,7 +374,7 @@ class SmootherEstimator:
         return MeasurementUpdate(motion, needs_keyframe=True)
 
     def _refuse(self, motion: RelativeMotion, quality: Quality) -> MeasurementUpdate:
-        """Leave a motion out, or reinitialise from vision where the prediction has proved to be wrong."""
+        """Leave out a motion that the gate refuses, or reinitialise from vision if the prediction has proved wrong."""
         refused = self._refused
         refused.add(motion, self._running.pose, self._tracked_ns)
         is_first_good = quality is Quality.GOOD and self._accepted == 0  # no motion has agreed with a standstill
@@ -410,7 +410,7 @@ class SmootherEstimator:
     # ------------------------------------------------------------------ breaks
 
     def _rebuild(self, stamp_ns: int, state: RigState, error: Exception) -> None:
-        """Make a new window around a state, after one that has no solution; status and epoch stay as they are."""
+        """Replace a window that has no solution by a new one around a state; status and epoch stay as they are."""
         self._report(stamp_ns, EventKind.WINDOW_REBUILT, str(error))
         was_lost, sigma_m = self._status.is_lost, self._sigma_m
         self._reinitialise(after_failure(stamp_ns, state, self.covariance), stamp_ns - 1)
@@ -441,10 +441,10 @@ class SmootherEstimator:
         )
 
     def _reinitialise_from_vision(self, motion: RelativeMotion, why: str) -> None:
-        """Reinitialise at the pose by refused motions that go on agreeing with each other: the prediction is at fault.
+        """Reinitialise at the pose that a chain of refused motions leads to: the prediction is wrong.
 
-        Their chain begins at a state that was accepted, or after a gap that the IMU alone has bridged. Unless the IMU
-        is known to have failed at that moment, or was corrected wrongly, the pose is uncertain by as much as it differs
+        The chain begins at a state that vision constrained, or after a gap that the IMU alone has bridged. Unless the
+        IMU is known to have failed at that moment, or was corrected wrongly, the pose is uncertain by its difference
         from the prediction.
         """
         refused, nav_T_body = self._refused, self._refused.nav_T_body[motion.stamp_ns]
@@ -456,7 +456,7 @@ class SmootherEstimator:
         if refused.is_distrusted:
             initial = with_wide_attitude(initial)
         if self._gap_s > _MIN_GAP_S and refused.is_after_gap:
-            # The velocity was wrong by more and more: the way through the gap is off by its mean.
+            # The velocity's error grew during the gap: its mean, half of the final error, displaced the position.
             off_m_s = float(np.linalg.norm(initial.state.velocity_nav - predicted.velocity_nav))
             initial = with_uncertain_position(initial, 0.5 * off_m_s * self._gap_s)
         self._reinitialise(initial, self._tracked_ns)
@@ -468,9 +468,9 @@ class SmootherEstimator:
         )
 
     def _reinitialise_from_prediction(self, motion: RelativeMotion) -> None:
-        """Go on from the prediction where motions that were refused are followed by one that agrees with it.
+        """Reinitialise at the prediction where refused motions are followed by one that agrees with it.
 
-        Whether vision was wrong until then, or the IMU, is not known: the pose is uncertain by their difference.
+        Whether vision or the IMU was wrong until then is not known: the pose is uncertain by their difference.
         """
         nav_T_body, predicted = self._refused.nav_T_body[motion.stamp_ns], self._running.state()
         initial = from_prediction(motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity)
@@ -513,7 +513,7 @@ class SmootherEstimator:
 
     @property
     def _may_be_moving(self) -> bool:
-        """Whether a standstill was assumed a moment ago, and images may show that it was none."""
+        """Whether the initialisation assumed a standstill, and there were too few motions yet to confirm it."""
         return self._is_standstill_assumed and self._accepted < _MAX_MOTIONS_OF_A_STANDSTILL
 
     @property

@@ -25,11 +25,11 @@ class RigState:
     """The rig at one instant.
 
     Attributes:
-        nav_T_body: (4, 4).
-        velocity_nav: (3,) m/s.
+        nav_T_body: (4, 4) pose.
+        velocity_nav: (3,) velocity in nav, m/s.
         gyro_bias: (3,) rad/s.
         accel_bias: (3,) m/s^2.
-        gravity_nav: (3,) m/s^2, downwards.
+        gravity_nav: (3,) gravity in nav, m/s^2, downwards.
     """
 
     nav_T_body: Float
@@ -52,7 +52,7 @@ class InitialUncertainty:
         gravity: (3, 3) covariance of gravity's direction in nav, (m/s^2)^2; zero where nav is level by definition, so
             that measurements turn the poses.
         inertial: (12, 12) joint covariance of velocity in nav, biases of accelerometer and gyro, and gravity in nav,
-            or None; it takes the place of their own ones.
+            or None; it replaces their separate uncertainties.
     """
 
     pose: Float
@@ -98,10 +98,10 @@ def gravity_by_tilt(nav_R_body: Float, of_pose: Float, gravity_nav: Float) -> Fl
     Args:
         nav_R_body: (3, 3) attitude of the pose.
         of_pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
-        gravity_nav: (3,) m/s^2.
+        gravity_nav: (3,) gravity in nav, m/s^2.
 
     Returns:
-        (3, 3), (m/s^2)^2.
+        (3, 3) covariance of gravity in nav, (m/s^2)^2.
     """
     turned = skew(gravity_nav) @ nav_R_body
     return np.asarray(turned @ of_pose[:3, :3] @ turned.T)
@@ -113,7 +113,7 @@ def certain_origin() -> Float:
 
 
 def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
-    """Split a pose's covariance into the prior of a first pose, and the part that the definition of nav takes over.
+    """Split a pose's covariance into the prior of a first pose, and the part that becomes uncertainty of nav.
 
     Args:
         nav_R_body: (3, 3) attitude of the pose.
@@ -141,7 +141,7 @@ def _origin_covariance(nav_R_body: Float, tilt: Float) -> Float:
 
 
 def level_R_nav(gravity_nav: Float) -> Float:
-    """Return the rotation (3, 3) that turns nav level, by gravity (3,) in nav; nav's x axis keeps its heading."""
+    """Return the rotation (3, 3) from nav to a level frame, for gravity (3,) in nav; nav's x axis keeps its heading."""
     return level(-gravity_nav)
 
 
@@ -149,8 +149,8 @@ def tilt_covariance(state: RigState, covariance: Float) -> Float:
     """Return the covariance (2, 2) of roll and pitch about the horizontal axes of nav turned level.
 
     Args:
-        state: The rig.
-        covariance: (9, 9) of its pose, tangent in body, and of gravity in nav.
+        state: State of the rig.
+        covariance: (9, 9) joint covariance of its pose, tangent in body, and of gravity in nav.
     """
     turn = level_R_nav(state.gravity_nav)
     across = np.array([[0.0, -1.0], [1.0, 0.0]]) / np.linalg.norm(state.gravity_nav)

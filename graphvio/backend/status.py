@@ -1,4 +1,4 @@
-"""What an estimate is based on: whether the state is initialised, tracked, predicted only, or lost."""
+"""The status of an estimate: whether the state is initialised, tracked, predicted only, or lost."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from graphvio.config.stages import InitialisationConfig
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 
-_MAX_INITIALISATION_S = 2.0  # later it is reported what is missing
+_MAX_INITIALISATION_S = 2.0  # after which the missing quantities are reported
 
 
 class StatusMonitor:
     """Decides the status of each estimate, and reports when the position is lost or initialisation takes long.
 
     Args:
-        max_sigma_m: Standard deviation of the position since vision last constrained it from which on it is lost.
+        max_sigma_m: Standard deviation of the position, since vision last constrained it, above which it is lost, m.
         report: Receives events.
 
     Attributes:
@@ -32,7 +32,7 @@ class StatusMonitor:
         self._report = report
         self._initialising_since_ns: int | None = None  # None once the first motions have determined what was missing
         self._was_complete = False  # whether nothing was missing at the estimate before
-        self._is_reported = False  # that initialisation takes long
+        self._is_reported = False  # whether it was reported that initialisation takes long
 
     def note_initialisation(self, initial: InitialState) -> None:
         """Record an initialisation: without a standstill, the first motions have to complete it."""
@@ -51,9 +51,9 @@ class StatusMonitor:
         Args:
             stamp_ns: Stamp of the estimate.
             is_constrained: Whether vision constrains it, or it has just been initialised.
-            sigma_m: Standard deviation of its position since vision last did.
+            sigma_m: Standard deviation of its position since vision last constrained it.
             has_imu: Whether the state has an IMU.
-            missing: Says what is not known well enough yet, or nothing; see `missing_of`.
+            missing: Returns what is not known well enough yet, or an empty string; see `missing_of`.
         """
         if is_constrained:
             return Status.INITIALISING if self._is_initialising(stamp_ns, has_imu, missing) else Status.TRACKING
@@ -87,7 +87,7 @@ class StatusMonitor:
 
 
 def missing_of(covariance: StateCovariance, config: InitialisationConfig) -> str:
-    """Say what of a state is not known well enough yet for its initialisation to be over, or nothing."""
+    """Return what is not known well enough for the initialisation of a state to be over, or an empty string."""
     if covariance.velocity is None or covariance.tilt is None:
         return ""
     tilt_deg = np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance.tilt)[-1]))

@@ -1,7 +1,8 @@
 """Estimation of the time offset between cameras and IMU from rotations by vision and by the gyro.
 
-A rotation that vision measures between two framesets is the gyro's at instants a little earlier or later. Over such an
-interval the two differ by the offset times the difference of the angular rates at its ends, and by the gyro's bias.
+The rotation that vision measures between two framesets is the one that the gyro measures between instants a little
+earlier or later. The two rotations differ by the offset times the difference of the angular rates at the ends of the
+interval, and by the gyro's bias.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from graphvio.rig import Imu
 
 _START_SIGMA_S = 0.01
 _START_BIAS_SIGMA_RAD_S = 0.1
-_WALK_S = 5e-5  # by which the offset may change in a second
-_INTERVAL_NS = 250_000_000  # shorter ones have less information, and longer ones' samples may be gone
+_WALK_S = 5e-5  # random walk of the offset over a second
+_INTERVAL_NS = 250_000_000  # shorter intervals have less information; samples of longer ones may be discarded already
 _ANGULAR_ACCEL_RAD_S2 = 10.0
 _USABLE_SIGMA_S = 2e-3
 _GATE_PROBABILITY = 0.999
@@ -34,7 +35,7 @@ class OffsetEstimate:
     """Estimated error of the offset in use.
 
     Attributes:
-        error_s: Add it to the offset in use.
+        error_s: Error, to be added to the offset in use.
         sigma_s: Standard deviation of the error.
     """
 
@@ -43,7 +44,7 @@ class OffsetEstimate:
 
     @property
     def is_usable(self) -> bool:
-        """Whether it is known well enough to correct by it."""
+        """Whether the error is known well enough to correct the offset by it."""
         return self.sigma_s < _USABLE_SIGMA_S
 
 
@@ -52,8 +53,8 @@ class TimeOffsetFilter:
 
     Args:
         imu: Noise densities of the IMU.
-        noise_scale: Factor on these.
-        imu_between: Returns the IMU between two framesets' stamps by the offset in use, or None.
+        noise_scale: Factor on the noise densities.
+        imu_between: Returns the IMU readings between two framesets' stamps, with the offset in use, or None.
     """
 
     def __init__(self, imu: Imu, noise_scale: float, imu_between: Callable[[int, int], ImuInterval | None]) -> None:
@@ -93,7 +94,7 @@ class TimeOffsetFilter:
                 return
 
     def corrected(self) -> float:
-        """Return the offset's error, seconds, which the caller corrects: it is zero from then on."""
+        """Return the offset's error, seconds, for the caller to correct, and set it to zero."""
         error_s = float(self._mean[0])
         self._mean[0] = 0.0
         return error_s
@@ -105,7 +106,7 @@ class TimeOffsetFilter:
         self._newest_ns = stamp_ns
 
     def _measure(self, start_R_end: Float, covariance: Float, interval: ImuInterval, error_s: float) -> None:
-        """Update by a rotation (3, 3) of vision, its covariance (3, 3) in the frame at its end, and the IMU."""
+        """Update by a rotation (3, 3) of vision, with its covariance (3, 3) in the frame at its end, and the IMU's."""
         by_gyro, by_bias = integrated_rates(interval.steps_s, interval.angular_velocity - self._mean[1:])
         residual = so3_log(np.ascontiguousarray(by_gyro.T @ start_R_end))
         rates = interval.angular_velocity[[0, -1]] - self._mean[1:]

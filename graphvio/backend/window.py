@@ -16,7 +16,7 @@ from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
 _STEP_SHARES = (1.0, 0.5, 0.25, 0.125)
-_CONVERGED = 1e-2  # radians, metres...: another step would change the square of this
+_CONVERGED = 1e-2  # radians, metres...: the next step would be of the order of its square
 
 
 class WindowError(GraphvioError):
@@ -24,15 +24,15 @@ class WindowError(GraphvioError):
 
 
 SOLVER_ERRORS = (WindowError, RuntimeError, np.linalg.LinAlgError)
-"""Raised by a window, gtsam and numpy where equations have no solution."""
+"""Errors raised by a window, gtsam and numpy where equations have no solution."""
 
 
 class GraphWindow:
     """Nonlinear factors and the present values of their variables.
 
     Args:
-        min_iterations: Of each optimisation; robust kernels need two, as the first weighs new factors by their
-            initial error.
+        min_iterations: Lower limit for the iterations of each optimisation; robust kernels need two, as the first
+            iteration weighs new factors by their initial error.
     """
 
     def __init__(self, min_iterations: int = 1) -> None:
@@ -41,11 +41,11 @@ class GraphWindow:
         self._graph = gtsam.NonlinearFactorGraph()
         self._involved: dict[int, frozenset[int]] = {}  # slot of the graph -> variables of the factor in it
         self._free: list[int] = []  # slots
-        self._marginal: Marginal | None = None  # of the variables that were eliminated last, and some added since
-        self._unknown: list[int] = []  # slots of the factors that it does not know
+        self._marginal: Marginal | None = None  # marginal of the variables eliminated last, and of some added since
+        self._unknown: list[int] = []  # slots of the factors that `_marginal` does not include
         self._known_keys: frozenset[int] = frozenset()  # variables of all other factors
         self._cholesky_suffices = True
-        self._dims: dict[int, int] = {}  # of variables; to ask gtsam is slow
+        self._dims: dict[int, int] = {}  # dimensions of variables; asking gtsam for them is slow
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         """Insert a factor; its variables must have values."""
@@ -55,8 +55,8 @@ class GraphWindow:
         """Optimise by Gauss-Newton from the present values.
 
         Args:
-            retained: Variables whose covariance will be needed, and to which new factors will be tied: it is then
-                found without solving the whole window again.
+            retained: Variables whose covariance will be needed, and which new factors will involve: their covariance is
+                then found without solving the whole window again.
 
         Raises:
             WindowError: if some variable is not constrained, or the solution is not finite; the values stay as
@@ -87,13 +87,14 @@ class GraphWindow:
     def advance(self, retained: Sequence[int]) -> bool:
         """Update only the variables that the last solution retained, and those inserted since then.
 
-        It is a step of a filter whose prior is the window's exact marginal; all other variables keep their values.
+        This is a filter step whose prior is the window's exact marginal; all other variables keep their values.
 
         Args:
-            retained: As for `optimize`, some of these variables, for the next time.
+            retained: As for `optimize`, some of these variables, for the next call.
 
         Returns:
-            Whether that was possible. Where it was not, or the step is too long for a linear one, nothing has changed.
+            Whether the update was made. It is not, and nothing changes, where the marginal lacks variables that the new
+            factors involve, or where the step is too long for a linear one.
         """
         if self._min_iterations > 1:
             return False
@@ -147,7 +148,7 @@ class GraphWindow:
         except RuntimeError as error:
             raise WindowError(f"a state cannot be marginalised: {_one_line(error)}") from None
         if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
-            self._take(None)  # else it still has the covariances of those that stay
+            self._take(None)  # else it still has the covariances of the variables that stay
         for slot in slots:
             self._graph.remove(slot)
             del self._involved[slot]
@@ -161,7 +162,7 @@ class GraphWindow:
         self._known_keys -= leaving
 
     def _improved(self, step: gtsam.VectorValues) -> gtsam.Values | None:
-        """Return the values after a long step, or a part of it, or None where all of these are worse.
+        """Return the values after a long step, or after a part of it that does not increase the error, or None.
 
         Where a direction is hardly constrained, such as the heading after time without images and IMU, a step along it
         may leave the range in which the equations are linear.
@@ -185,7 +186,7 @@ class GraphWindow:
         return slot
 
     def _solve(self, last: Sequence[int]) -> gtsam.GaussianBayesTree:
-        """Eliminate the window at its present values, some variables last, and keep their marginal."""
+        """Eliminate the window at its present values, with the variables ``last`` last, and keep their marginal."""
         if len(self._graph.keyVector()) < self.values.size():
             loose = set(self.values.keys()).difference(*self._involved.values())
             raise WindowError(f"no factor constrains variable {_named([min(loose)])}")
@@ -200,9 +201,9 @@ class GraphWindow:
         return solution
 
     def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
-        """Eliminate by Cholesky, or by QR from the first time on that Cholesky's precision does not suffice.
+        """Eliminate by Cholesky factorisation, or by QR once the precision of Cholesky has not sufficed.
 
-        Cholesky takes half of the time, but fails where biases hardly walk.
+        Cholesky takes half of the time, but fails where the random walk of the biases is very small.
         """
         if self._cholesky_suffices:
             try:
@@ -212,9 +213,9 @@ class GraphWindow:
         return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
     def _extended_marginal(self, last: Sequence[int] = ()) -> Marginal | None:
-        """Return the marginal with the newest factors and their variables, some of them last.
+        """Return the marginal with the newest factors and their variables, ordered so that ``last`` are the last ones.
 
-        None if they are tied to variables that it does not have.
+        None if these factors involve variables that the marginal does not include.
         """
         if self._marginal is None:
             return None
@@ -226,12 +227,12 @@ class GraphWindow:
         return self._marginal.extended(linear, last, self._known_dims(retained | touched))
 
     def _take(self, marginal: Marginal | None) -> None:
-        """Keep a marginal that includes all factors."""
+        """Store a marginal that includes all factors, or None."""
         self._known_keys |= frozenset().union(*(self._involved[slot] for slot in self._unknown))
         self._marginal, self._unknown = marginal, []
 
     def _known_dims(self, keys: Iterable[int]) -> dict[int, int]:
-        """Return the dimensions of these variables and others."""
+        """Return the dimensions of variables, at least of these."""
         if not all(map(self._dims.__contains__, keys)):
             self._dims = self.values.dims()
         return self._dims

@@ -29,7 +29,7 @@ OnFrameset = Callable[[int, SeparateMotions], bool]
 """Called after each frameset with the number of framesets and all motions so far; returns True to end the recording."""
 
 _NO_ERROR = np.zeros((6, 6))
-_MIN_MEASURED = 0.04  # of the motions of the pair that has most: exchanged images have as many by chance
+_MIN_MEASURED = 0.04  # relative to the best pair's number of motions: exchanged images reach this by chance
 
 
 def calibrate_pairs(
@@ -42,15 +42,15 @@ def calibrate_pairs(
 ) -> Calibration:
     """Calibrate the relative poses of a rig's stereo pairs from a recording of its motion (section 4).
 
-    Every pair tracks by itself; the poses of the pairs in the rig file do not matter, nor whether views overlap. Pairs
-    must have one clock but need not be triggered together.
+    Every pair tracks by itself; neither the poses of the pairs in the rig file nor an overlap of their views matter.
+    Pairs must have one clock but need not be triggered together.
 
     Args:
         source: a recording, or its folder.
-        config: of the front-ends.
-        seed: of all random choices.
+        config: configuration of the front-ends.
+        seed: seed of all random choices.
         scale_mode: whether to estimate ratios of the lengths that pairs measure, see `calibrate_pair`.
-        on_frameset: follows the recording, and may end it.
+        on_frameset: called after each frameset; may end the recording.
 
     Returns:
         The poses of all pairs with their covariance, the comparison with the rig file, and what they are based on.
@@ -58,7 +58,7 @@ def calibrate_pairs(
     Raises:
         CalibrationError: if the rig has one pair only, or the recording does not determine the poses of the pairs.
         SourceError: if the recording cannot be read.
-        RigError: if it has no usable calibration of each pair's own cameras.
+        RigError: if the rig has no usable calibration of each pair's own cameras.
     """
     opened = open_source(source) if isinstance(source, str | Path) else source
     rig = opened.rig
@@ -97,9 +97,9 @@ def calibrate_trajectories(
 
     Args:
         trajectories: J trajectories ``world_T_camera``, each in a world frame and on a clock of its own.
-        names: of the J cameras.
+        names: names of the J cameras.
         same_clock: whether all stamps are of one clock; else offsets and drifts are estimated.
-        seed: of all random choices.
+        seed: seed of all random choices.
         scale_mode: whether to estimate ratios of the lengths that odometries measure, see `calibrate_pair`.
 
     Returns:
@@ -147,7 +147,7 @@ def calibrate_trajectories(
 def _track(
     source: Source, separate: SeparateMotions, on_frameset: OnFrameset | None
 ) -> tuple[int, list[CameraMotions], Int, Float]:
-    """Track every pair by itself through a recording, as long as ``on_frameset`` wants it, and collect the gyro.
+    """Track every pair by itself through a recording, until ``on_frameset`` ends it, and collect the gyro's samples.
 
     Returns the number of framesets, the motions of each pair, and stamps (N,) and angular rates (N, 3), rad/s, of body.
     """
@@ -175,7 +175,7 @@ def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:
 
 
 def _imu(rig: Rig, segments: Segments, stamps_ns: Int, gyro: Float) -> tuple[dict[int, ImuAlignment], list[str]]:
-    """Align all left cameras with the IMU; the second value says why some could not be."""
+    """Align all left cameras with the IMU; return the alignments, and the reasons why some could not be found."""
     if rig.imu is None or not len(stamps_ns):
         return {}, []
     found, missing = {}, []

@@ -1,4 +1,4 @@
-"""The motion that each stereo pair measures by itself, between any two instants, with its covariance (section 4)."""
+"""Motions of each stereo pair by its own visual odometry, between any two instants, with covariance (section 4)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphvio.measurements.motion import Quality, RelativeMotion
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 
-_MAX_GAP_NS = 150_000_000  # between instants, over which a motion is interpolated
+_MAX_GAP_NS = 150_000_000  # longest time between two instants over which a motion is interpolated
 _INTERPOLATION_SIGMA = 5e-5  # radians and metres, over 50 ms; a cubic's error grows with the fourth power
 
 
@@ -27,15 +27,15 @@ class CameraMotions:
 
     Instants form a tree: the parent of each is its reference, as vision sees that one. The reference as seen differs
     from the reference itself by the error of its triangulated points, which all motions from it share; that error is
-    counted once on the way between two instants, or not at all where both were measured from the same reference.
+    counted once on the path between two instants, or not at all where both were measured from the same reference.
 
     Args:
-        stamps_ns: N instants, with or without motions that end there.
-        motions: of body.
-        body_T_left: (4, 4).
+        stamps_ns: stamps of N instants, with or without motions that end there.
+        motions: motions of body.
+        body_T_left: (4, 4) pose of the left camera in body.
 
     Attributes:
-        stamps_ns: (N,).
+        stamps_ns: (N,) stamps of the instants, in order.
     """
 
     def __init__(self, stamps_ns: Iterable[int], motions: Iterable[RelativeMotion], body_T_left: Float) -> None:
@@ -56,7 +56,7 @@ class CameraMotions:
 
     @property
     def count(self) -> int:
-        """Number of motions."""
+        """Number of measured motions."""
         return len(self._edge)
 
     def between(self, start_ns: int, end_ns: int) -> tuple[Float, Float] | None:
@@ -113,7 +113,7 @@ class CameraMotions:
         ups: list[int] = []
         downs: list[int] = []
         up, down = start_ns, end_ns
-        while up != down:  # a reference is earlier than what is measured from it: the later of both goes back
+        while up != down:  # a reference is earlier than motions from it: step back from the later of both
             path, later = (ups, up) if up > down else (downs, down)
             if later not in self._reference:
                 return None
@@ -125,11 +125,11 @@ class CameraMotions:
         common = up
         motion, covariance = np.eye(4), np.zeros((6, 6))
         for i, stamp in enumerate(ups):
-            if i:  # from the reference to itself as seen
+            if i:  # from the reference to the reference as seen
                 covariance = covariance + self._shared_of(stamp)
             covariance = _carried(covariance + self._edge[stamp][1], self._edge[stamp][0])
             motion = motion @ se3_inverse(self._edge[stamp][0])
-        if bool(ups) != bool(downs):  # the way begins or ends at the common reference itself
+        if bool(ups) != bool(downs):  # the path begins or ends at the common reference itself
             covariance = covariance + self._shared_of(common)
         for i, stamp in enumerate(reversed(downs)):
             edge, own = self._edge[stamp]
@@ -140,7 +140,7 @@ class CameraMotions:
         return motion, covariance
 
     def _view_covariance(self, reference_ns: int, moved: Float, shared: Float) -> Float:
-        """Covariance of a reference's view, as given by its first motion, in the frame at a motion's end."""
+        """Return the covariance of a reference's view, given by its first motion, in the frame at a motion's end."""
         if reference_ns not in self._shared:
             self._shared[reference_ns] = _carried(shared, moved)
         return _carried(self._shared[reference_ns], se3_inverse(moved))
@@ -150,7 +150,7 @@ class CameraMotions:
 
 
 class _Placed(NamedTuple):
-    """The camera at an instant: its own instant before it, the pose relative to that, and its covariance (6, 6)."""
+    """An interpolated pose: the camera's own instant before it, the pose relative to that, and covariance (6, 6)."""
 
     near_ns: int
     near_T_instant: Float
@@ -158,7 +158,7 @@ class _Placed(NamedTuple):
 
 
 def _polynomial(nodes: list[float], values: list[Float], at: float) -> Float:
-    """Lagrange polynomial through values at nodes."""
+    """Evaluate the Lagrange polynomial through values at nodes."""
     total = np.zeros_like(values[0])
     for i, value in enumerate(values):
         total += value * np.prod([(at - other) / (nodes[i] - other) for k, other in enumerate(nodes) if k != i])

@@ -1,4 +1,4 @@
-"""The relation between the clocks of two cameras on one rig, from the angular speeds of their trajectories.
+"""Estimation of the relation between two cameras' clocks on one rig, from the angular speeds of their trajectories.
 
 The angular speed is the same for all cameras of a rig, so the offset is where the correlation of both speeds over time
 has its maximum; nothing else needs to be known.
@@ -28,7 +28,7 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class ClockRelation:
-    """Offset and drift between the clocks of two trajectories."""
+    """The offset and drift between the clocks of two trajectories."""
 
     offset_ns: int  # add it to a stamp of the first to get the second's of the same instant, at `at_ns`
     drift: float  # rate at which the offset grows, seconds per second
@@ -66,7 +66,7 @@ class ClockOffset(NamedTuple):
     """The offset between two clocks."""
 
     offset_ns: int  # add it to a stamp of the first clock to get that of the second one at the same instant
-    correlation: float  # of the angular speeds at that offset, at most 1
+    correlation: float  # correlation of the angular speeds at that offset, at most 1
 
 
 def find_offset(one: Trajectory, other: Trajectory) -> ClockOffset:
@@ -107,7 +107,7 @@ def find_offset(one: Trajectory, other: Trajectory) -> ClockOffset:
 
 
 def _angular_speeds(trajectory: Trajectory) -> Float:
-    """Mean angular speeds (N,), rad/s, around instants 1 / `_RATE_HZ` apart, from half the averaging time on."""
+    """Return mean angular speeds (N,), rad/s, at instants 1 / `_RATE_HZ` apart, from half the averaging time on."""
     if trajectory.duration_s <= _OVER_S:
         return np.zeros(0)
     half_ns = round(0.5 * _OVER_S * _NS_PER_S)
@@ -121,7 +121,7 @@ def _angular_speeds(trajectory: Trajectory) -> Float:
 
 
 def _correlations(one: Float, other: Float, least: int) -> tuple[Float, Int]:
-    """Correlation coefficients (L,) at lags (L,) of the second series, for overlaps of ``least`` samples or more."""
+    """Return correlation coefficients (L,) and lags (L,) of the second series, for ``least`` common samples or more."""
     from scipy.signal import fftconvolve  # takes a second to import, and only trajectories need it
 
     def summed(a: Float, b: Float) -> Float:
@@ -142,7 +142,7 @@ def _correlations(one: Float, other: Float, least: int) -> tuple[Float, Int]:
 
 
 def _vertex(values: Float, best: int) -> float:
-    """Vertex of a parabola through a maximum and its neighbours, in samples from the maximum."""
+    """Return the vertex of a parabola through a maximum and its neighbours, in samples from the maximum."""
     if not 0 < best < len(values) - 1:
         return 0.0
     left, top, right = values[best - 1 : best + 2]

@@ -1,4 +1,4 @@
-"""Test whether the paper's method and the graph differ by more than noise explains.
+"""A test whether the paper's method and the graph differ by more than noise explains.
 
 Both are functions of the same noisy motions, so their errors are correlated: the covariance of their difference is
 propagated, to first order, from each pose pair's noise to both solutions.
@@ -19,7 +19,7 @@ from graphvio.calibration.paper_method import PaperSolution, PoseParts, jacobian
 from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log, skew
 
-_CHANCE = 1e-3  # of a false alarm
+_CHANCE = 1e-3  # probability of a false alarm
 _LINEARISATION = 0.1  # error of the first-order propagation, in the solution's sigmas
 
 
@@ -50,7 +50,7 @@ class Comparison:
 
 
 def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, dispersion: float = 1.0) -> Comparison:
-    """Compare two solutions for the same N pose pairs, whose motions' covariances are scaled by the dispersion.
+    """Compare two solutions for the same N pose pairs; the dispersion scales the covariances of their motions.
 
     The graph's nuisance variables must be about zero.
     """
@@ -69,7 +69,7 @@ def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, disper
 
 
 def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
-    """Return derivatives (2 N, 6, 6) of the paper's solution with respect to errors of first, then second motions."""
+    """Return derivatives (2 N, 6, 6) of the paper's solution by the errors of all first, then all second motions."""
     R = paper.left2_T_left1[:3, :3]
     t = -R.T @ paper.left2_T_left1[:3, 3]
     J = jacobians(PoseParts.of(pairs), R) * paper.inlier[:, None, None]

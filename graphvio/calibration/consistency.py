@@ -1,4 +1,4 @@
-"""Errors of pose pairs given the relative pose of the cameras, and which pose pairs are outliers.
+"""Errors of pose pairs for a relative pose of the cameras, and detection of outliers among the pose pairs.
 
 A motion of the first camera, seen from the second, is ``left2_T_left1 motion_1 left1_T_left2``; it must be motion_2
 (section 4, eq. 1). Errors are weighted by the covariances of both motions.
@@ -22,14 +22,14 @@ LIMIT = float(2.0 * gammaincinv(3.0, 0.999))  # chi-square of 6
 
 _MAX_ROUNDS = 100
 _STEPS_A_ROUND = 2
-_SHARPENING = 1.4  # of the cost from round to round, towards truncated least squares
+_SHARPENING = 1.4  # factor on the cost's sharpness per round, towards truncated least squares
 _CERTAIN = 1e-3  # weights this near to 0 or 1 count as such
 _CONVERGED = 1e-12
-_MAX_STEP = 0.5  # radians and metres: from few motions the first steps may lead anywhere
+_MAX_STEP = 0.5  # radians and metres: with few motions the first steps may be far too long
 
 
 class Consensus(NamedTuple):
-    """A solution that most pose pairs agree on."""
+    """A relative pose on which most pose pairs agree."""
 
     left2_T_left1: Float  # (4, 4)
     nuisances: Float  # (M,) values of the nuisance variables
@@ -61,13 +61,13 @@ def without_outliers(pairs: PosePairs, start: Float, held: Float, nuisances: Nui
     """
     initial = _at(pairs, start, nuisances, np.zeros(len(nuisances.sigmas)))
     graduated = _graduated(pairs, initial, held, nuisances)
-    # Where most pose pairs are outliers, a solution for all of them is no good start, but the given one may be.
+    # Where most pose pairs are outliers, a solution for all of them is a bad start, but the given pose may be good.
     near = _refined(pairs, initial, held, nuisances)
     return min(graduated, near, key=lambda each: float(np.minimum(each.squares, LIMIT).sum()))
 
 
 def _graduated(pairs: PosePairs, initial: Consensus, held: Float, nuisances: Nuisances) -> Consensus:
-    """Go from a convex cost to truncated least squares."""
+    """Minimise a sequence of costs, from a convex one to truncated least squares."""
     found = _solve(pairs, initial, np.ones(len(pairs)), _MAX_ROUNDS, held, nuisances)
     sharpness = 1.0 / max(2.0 * found.squares.max() / LIMIT - 1.0, 1.0)
     for _ in range(_MAX_ROUNDS):
@@ -92,7 +92,7 @@ def _refined(pairs: PosePairs, found: Consensus, held: Float, nuisances: Nuisanc
 def _solve(
     pairs: PosePairs, start: Consensus, weights: Float, max_steps: int, held: Float, nuisances: Nuisances
 ) -> Consensus:
-    """Gauss-Newton with weights (N,) of the pose pairs; directions ``held`` (K, 6) stay as they are."""
+    """Minimise by Gauss-Newton with weights (N,) of the pose pairs; directions ``held`` (K, 6) stay as they are."""
     found = start
     free = np.eye(6 + len(found.nuisances))
     free[:6, :6] -= held.T @ held
@@ -114,14 +114,14 @@ def _at(pairs: PosePairs, left2_T_left1: Float, nuisances: Nuisances, values: Fl
 
 
 def _weights(squares: Float, sharpness: float) -> Float:
-    """Eq. (14) of the paper on graduated non-convexity."""
+    """Return the weights (N,) by eq. (14) of the paper on graduated non-convexity."""
     low, high = (LIMIT * bound for bound in (sharpness / (sharpness + 1.0), (sharpness + 1.0) / sharpness))
     between = np.sqrt(LIMIT * sharpness * (sharpness + 1.0) / np.maximum(squares, low)) - sharpness
     return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, between))
 
 
 def information(pairs: PosePairs, left2_T_left1: Float) -> Float:
-    """Fisher information (6, 6) of pose pairs on ``left2_T_left1``, tangent in left1."""
+    """Return the Fisher information (6, 6) of pose pairs on ``left2_T_left1``, tangent in left1."""
     _, jacobians = whitened(pairs, left2_T_left1)
     return np.asarray(np.einsum("nki,nkj->ij", jacobians, jacobians))
 
@@ -135,7 +135,7 @@ def whitened(
         pairs: N pose pairs.
         left2_T_left1: (4, 4).
         nuisances: M variables.
-        values: (M,) of the nuisance variables.
+        values: (M,) values of the nuisance variables.
 
     Returns:
         Errors (N, 6) of unit covariance, and derivatives (N, 6, 6 + M) with respect to the tangent of ``left2_T_left1``

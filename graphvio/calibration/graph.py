@@ -1,4 +1,4 @@
-"""P_12 as a factor graph: one unknown pose, and a factor for each pose pair that is not an outlier."""
+"""Estimation of P_12 by a factor graph with one unknown pose, and a factor for each pose pair that is no outlier."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HELD_SIGMA = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class GraphSolution:
-    """The graph's solution."""
+    """The solution of the factor graph."""
 
     left2_T_left1: Float  # (4, 4), the paper's P_12
     # (6, 6) of left2_T_left1, tangent ``[rotation, translation]`` in left1; very large in directions that the motions
@@ -32,7 +32,7 @@ class GraphSolution:
     covariance: Float
     inlier: Bool  # (N,) pose pairs that are not outliers
     squares: Float  # (N,) squared Mahalanobis distances of all pose pairs' errors, 6 degrees of freedom each
-    observability: Observability  # of left2_T_left1 from the inliers
+    observability: Observability  # observability of left2_T_left1 from the inliers
     nuisances: Float  # (M,) values of the nuisance variables
     nuisance_covariance: Float  # (M, M) of these
 
@@ -43,7 +43,7 @@ def solve(pairs: PosePairs, start: Float, nuisances: Nuisances | None = None) ->
     Args:
         pairs: N pose pairs.
         start: initial ``left2_T_left1`` (4, 4), which is kept in directions that the motions do not determine.
-        nuisances: variables to estimate with it; None for no such variables.
+        nuisances: nuisance variables to estimate as well, or None.
 
     Raises:
         CalibrationError: if fewer than three pose pairs agree.
@@ -87,7 +87,7 @@ def solve(pairs: PosePairs, start: Float, nuisances: Nuisances | None = None) ->
 
 
 def holding(key: int, held: Float, there: Float) -> gtsam.NonlinearFactor:
-    """Return a factor that keeps a pose near another one (4, 4) in some directions (K, 6), tangent in it."""
+    """Return a factor that keeps a pose near another one (4, 4) in directions (K, 6) of the latter's tangent."""
     inverse = se3_inverse(np.ascontiguousarray(there))
 
     def error(_: Any, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
@@ -100,7 +100,7 @@ def holding(key: int, held: Float, there: Float) -> gtsam.NonlinearFactor:
 
 
 def _factor(pairs: PosePairs, k: int, left2_T_left1: Float, by_nuisances: Float | None) -> gtsam.NonlinearFactor:
-    """Factor of pose pair k, weighted at ``left2_T_left1``; derivatives (6, M) with respect to nuisance variables."""
+    """Return the factor of pose pair k, weighted at ``left2_T_left1``; ``by_nuisances`` are derivatives (6, M)."""
     motion_1, motion_2 = pairs.motion_1[k], pairs.motion_2[k]
 
     def error(_: Any, values: gtsam.Values, jacobians: list[Float] | None) -> Float:

@@ -24,13 +24,13 @@ _INITIAL_ADVICE = "turn the rig about two axes, one after the other, by 30 degre
 
 @dataclass(frozen=True)
 class Advice:
-    """Accuracy so far of the pair whose pose is least accurate."""
+    """The accuracy so far of the pair whose pose is least accurate, and what is needed to improve it."""
 
-    name: str  # of the pair
+    name: str  # name of the pair
     motions: int  # number of its motions
     rotation_sigma_deg: float  # largest over all directions; infinite without a solution
     translation_sigma_m: float  # largest over all directions; infinite without a solution
-    missing: str  # a sentence on what to do; empty if only more of the same is needed
+    missing: str  # a sentence on what to do; empty if more motions of the same kind suffice
 
     @property
     def is_enough(self) -> bool:
@@ -50,7 +50,7 @@ class Advice:
 
 
 class Guide:
-    """Follows a recording of pairs with these names and gives advice on each one's pose relative to the first."""
+    """Gives advice during a recording on the pose of each pair relative to the first; takes the pairs' names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
@@ -59,7 +59,7 @@ class Guide:
         self._until_ns: int | None = None
 
     def advise(self, motions: Sequence[CameraMotions]) -> Advice:
-        """Return what to do next, after all motions that each pair has measured up to now."""
+        """Return advice on what to do next, from all motions that each pair has measured up to now."""
         self._take(motions)
         advice = [self._advice(j) for j in range(1, len(self._names))]
         return max(advice, key=lambda each: (bool(each.missing), each.translation_sigma_m, each.rotation_sigma_deg))

@@ -1,4 +1,4 @@
-"""Rotation of a camera in body (= IMU) and their time offset, from rotations by gyro and vision.
+"""Estimation of a camera's rotation in body (= IMU) and of their time offset, from rotations by gyro and vision.
 
 With ``R`` the camera's rotation in body, body turns by ``R turn R^T`` where the camera turns by ``turn``; the gyro,
 less its bias, must have measured that over the same interval by its own clock. Unknowns are a small rotation of ``R``,
@@ -23,7 +23,7 @@ from graphvio.rig import Imu
 
 _LIMIT = float(chdtri(3, 1e-3))
 _SIGMAS = 4.0
-_FLOOR_RAD = 1e-3  # systematic: scale and axes of a gyro
+_FLOOR_RAD = 1e-3  # systematic error: scale and axes of a gyro
 _FLOOR_S = 2e-4
 _MIN_MOTIONS = 10
 _MIN_TURNED = 3.0  # rms rotation about the second axis over the noise
@@ -36,7 +36,7 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True, eq=False)
 class ImuAlignment:
-    """Rotation and time offset of a left camera against the IMU."""
+    """The rotation and time offset of a left camera relative to the IMU."""
 
     body_R_left: Float  # (3, 3)
     misrotation: Float  # (3,) rotation vector, radians in body, from the rig's rotation to this one
@@ -57,7 +57,7 @@ class ImuAlignment:
         return abs(self.time_offset_s - self.rig_time_offset_s) > _SIGMAS * self.time_offset_sigma_s
 
     def warnings(self, name: str) -> list[str]:
-        """Describe a wrong rotation and a wrong time offset, a sentence each, of the pair of this name."""
+        """Return sentences on a wrong rotation and a wrong time offset of the pair with this name."""
         sentences = []
         if self.is_turned:
             angle, sigma = np.linalg.norm(self.misrotation), np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])
@@ -77,12 +77,12 @@ def align(segments: Segments, camera: int, stamps_ns: Int, gyro: Float, imu: Imu
     """Estimate rotation and time offset of one camera.
 
     Args:
-        segments: of all cameras.
-        camera: its index.
-        stamps_ns: (S,) of the gyro, increasing.
-        gyro: (S, 3) rad/s in body.
-        imu: noise, and the time offset in the rig.
-        body_R_left: (3, 3) in the rig.
+        segments: segments of all cameras.
+        camera: index of the camera.
+        stamps_ns: (S,) stamps of the gyro's samples, increasing.
+        gyro: (S, 3) angular rates in body, rad/s.
+        imu: the rig's IMU, with noise and time offset.
+        body_R_left: (3, 3) rotation of the left camera in the rig file.
 
     Raises:
         CalibrationError: if gyro and vision do not overlap in time, or the rig did not turn about two axes.
@@ -147,12 +147,12 @@ class _Rotations:
         return bool(second > _MIN_TURNED**2 * noise)
 
     def by_gyro(self, offset_s: float, bias: Float) -> Float:
-        """Integrate rotations (N, 3, 3) of body from start to end."""
+        """Integrate the gyro to rotations (N, 3, 3) of body from start to end of the segments."""
         start, end = self._start_s + offset_s, self._end_s + offset_s
         return np.asarray(_integrated(self._times_s, self._gyro - bias, start, end))
 
     def likeliest_offset(self, around_s: float) -> float:
-        """Find the offset at which the angles of both agree best; angles do not depend on the rotation in body."""
+        """Find the offset at which the angles of both agree best; they are independent of the rotation in body."""
         angles = np.array([np.linalg.norm(so3_log(turn)) for turn in self.turns])
         tried = around_s + np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + 1e-9, _COARSE_S)
 
@@ -163,7 +163,7 @@ class _Rotations:
         return float(min(tried.tolist(), key=misfit))
 
     def solve(self, rotation: Float, offset_s: float) -> _Solution:
-        """Gauss-Newton on the inliers, from an initial rotation and offset."""
+        """Minimise the inliers' errors by Gauss-Newton, from an initial rotation and offset."""
         bias = np.zeros(3)
         normal, cost, weight = np.eye(7), np.inf, np.zeros(0)
         duration = self._end_s - self._start_s
@@ -173,7 +173,7 @@ class _Rotations:
             noise = noise + (self._gyro_variance * duration)[:, None, None] * np.eye(3)
             information = np.linalg.inv(noise)
             squares = np.einsum("ni,nij,nj->n", errors, information, errors)
-            scale = max(float(np.median(squares)) / float(chdtri(3, 0.5)), 1.0)  # of the noise
+            scale = max(float(np.median(squares)) / float(chdtri(3, 0.5)), 1.0)  # factor on the noise
             weight = (squares < scale * _LIMIT).astype(np.float64)
             cost = float(np.minimum(squares, _LIMIT).sum())
             weighted = np.einsum("n,nki,nkl->nil", weight, jacobians, information)
@@ -194,7 +194,7 @@ class _Rotations:
     def _linearised(self, rotation: Float, bias: Float, offset_s: float) -> tuple[Float, Float]:
         """Compute errors (N, 3) in body at the end, and derivatives (N, 3, 7).
 
-        These are with respect to left rotation, bias and offset.
+        The derivatives are with respect to left rotation, bias and offset.
         """
         by_vision = rotation @ self.turns @ rotation.T
         by_gyro = self.by_gyro(offset_s, bias)

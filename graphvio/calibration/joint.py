@@ -1,4 +1,4 @@
-"""All cameras at once: one factor graph, whose relative poses close every loop.
+"""Calibration of all cameras at once by one factor graph, whose relative poses close every loop.
 
 For each segment the first camera's true motion is an unknown, of which every camera's own motion is a
 measurement through that camera's pose on the rig. With two cameras this is the graph of `calibration.graph`; with
@@ -30,7 +30,7 @@ _AGREEING = 0.5  # share of the other cameras that a motion must agree with
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Poses of the first camera in each of J cameras."""
+    """The poses of the first camera in each of J cameras."""
 
     left_T_left1: Float  # (J, 4, 4) pose of the first left camera in each; the first is the identity
     covariance: Float  # (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1
@@ -44,7 +44,7 @@ def solve(segments: Segments, start: Float, held: Sequence[Float]) -> JointSolut
     """Find the maximum-likelihood poses of all cameras.
 
     Args:
-        segments: N that do not overlap, of J cameras.
+        segments: N segments of J cameras that do not overlap.
         start: initial ``left_T_left1`` (J, 4, 4).
         held: for each camera but the first, directions (K, 6) in which the initial pose is kept.
 
@@ -86,7 +86,7 @@ def _motion(segment: int) -> int:
 
 
 def _factor(segment: int, camera: int, measured: Float, covariance: Float) -> gtsam.NonlinearFactor:
-    """Factor of a camera's motion as a measurement of the first camera's; a prior where it is the first camera."""
+    """Return the factor of a camera's motion as a measurement of the first camera's; a prior for the first camera."""
     noise, measured = gaussian(covariance), np.ascontiguousarray(measured)
     if camera == 0:
         return gtsam.PriorFactorPose3(_motion(segment), gtsam.Pose3(measured), noise)
@@ -104,7 +104,7 @@ def _factor(segment: int, camera: int, measured: Float, covariance: Float) -> gt
 
 
 def _agreeing(segments: Segments, left_T_left1: Float) -> Bool:
-    """Mask (N, J) of motions that agree with at least half of the others over the same segment."""
+    """Return the mask (N, J) of motions that agree with at least half of the others over the same segment."""
     agree = _agreements(segments.motions, segments.covariances, segments.known, left_T_left1, LIMIT)
     others = segments.known.sum(axis=1, keepdims=True) - 1
     return np.asarray(segments.known & (agree > 0) & (agree >= _AGREEING * others))

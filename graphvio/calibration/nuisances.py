@@ -1,4 +1,4 @@
-"""Nuisance variables of a calibration, and one of them: the ratio of the lengths that two cameras measure.
+"""Nuisance variables of a calibration, among them the ratio of the lengths that two cameras measure.
 
 A pair whose baseline is wrong by 1 % measures all motions 1 % too long or too short.
 """
@@ -16,7 +16,7 @@ from graphvio.calibration.pose_pairs import PosePairs
 ScaleMode = Literal["auto", "estimate", "fixed"]
 
 _SIGNIFICANT = 4.0  # sigmas
-_MIN_LOG_RATIO = 2e-3  # what a good calibration of a pair leaves
+_MIN_LOG_RATIO = 2e-3  # error that a good calibration of a pair leaves
 _LOG_RATIO_SIGMA = 0.1  # a priori
 
 
@@ -28,7 +28,7 @@ class Nuisances(NamedTuple):
 
     @staticmethod
     def none(count: int) -> Nuisances:
-        """Return no variables (M = 0) for a number of pose pairs."""
+        """Return an empty set of variables (M = 0) for ``count`` pose pairs."""
         return Nuisances(np.zeros((count, 6, 0)), np.zeros(0))
 
     def select(self, rows: Bool | Int) -> Nuisances:
@@ -47,7 +47,7 @@ class Nuisances(NamedTuple):
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """Ratio of the second camera's lengths to the first's."""
+    """The ratio of the second camera's lengths to the first's."""
 
     log_ratio: float  # natural logarithm, so 0.01 where the second measures 1 % longer
     sigma: float  # standard deviation of log_ratio
@@ -58,7 +58,7 @@ class ScaleCheck:
         return abs(self.log_ratio) > max(_SIGNIFICANT * self.sigma, _MIN_LOG_RATIO)
 
     def describe(self, first: str, second: str) -> str:
-        """Return a sentence about the cameras of these names."""
+        """Return a sentence about the ratio for cameras with these names."""
         longer = "longer" if self.log_ratio > 0.0 else "shorter"
         return (
             f"{second} measures lengths {100 * abs(np.expm1(self.log_ratio)):.2f} % (+- {100 * self.sigma:.2f}) "
@@ -67,7 +67,7 @@ class ScaleCheck:
 
 
 def rescaled(pairs: PosePairs, log_ratio: float) -> PosePairs:
-    """Return pose pairs whose second motions are corrected by a ratio of lengths."""
+    """Return the pose pairs with their second motions corrected for a ratio of lengths."""
     motion_2 = pairs.motion_2.copy()
     motion_2[:, :3, 3] *= np.exp(-log_ratio)
     return replace(pairs, motion_2=motion_2)

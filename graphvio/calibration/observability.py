@@ -1,8 +1,8 @@
 """Observability of the relative pose of two cameras from the motions of a recording.
 
-Rotation about one axis only leaves the offset of the cameras along it undetermined; without rotation, all of the offset
-is. The noise of the motions looks like a little rotation about every axis, and so like information: information that is
-not well above that of the noise does not count.
+Rotation about one axis only leaves the offset of the cameras along it undetermined; without rotation, the whole offset
+is undetermined. The noise of the motions looks like a little rotation about every axis, and so like information:
+information that is not well above that of the noise does not count.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.kernels import kernel
 
-_MIN_LEAD = 4.0  # information over that of noise alone
-_FLOOR = 1e-9  # of the noise's information over the largest, for a stable division
+_MIN_LEAD = 4.0  # ratio of information to that of noise alone
+_FLOOR = 1e-9  # lower bound for the noise's information relative to all of it, for a stable division
 _UNKNOWN_SIGMAS = np.repeat([np.pi, 5.0], 3)  # radians and metres, of undetermined directions
 _ALONG = 0.9  # cosine from which an axis is named after the camera's own
 _AXES = ("x (right)", "y (down)", "z (forward)")
@@ -46,7 +46,7 @@ class Observability:
 
 
 def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
-    """Determine what pose pairs determine of ``left2_T_left1``, at a solution (4, 4)."""
+    """Find the directions of ``left2_T_left1`` that pose pairs determine, at a solution (4, 4)."""
     motions = pairs.motion_1, pairs.covariance_1, pairs.covariance_2
     known, by_noise = information(pairs, left2_T_left1), _noise_information(left2_T_left1, *motions)
     scale = np.diag(_UNKNOWN_SIGMAS)  # so that radians and metres compare
@@ -73,7 +73,7 @@ def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
 
 @kernel
 def _noise_information(left2_T_left1: Float, motion_1: Float, covariance_1: Float, covariance_2: Float) -> Float:
-    """Return the expected information (6, 6) that the noise of the motions adds."""
+    """Return the expected information (6, 6) that the motions' noise alone appears to give."""
     total = np.zeros((6, 6))
     adjoint = se3_adjoint(left2_T_left1)
     for k in range(len(motion_1)):
@@ -88,7 +88,7 @@ def _noise_information(left2_T_left1: Float, motion_1: Float, covariance_1: Floa
 
 @kernel
 def _small_adjoint(tangent: Float) -> Float:
-    """Matrix ad(d) (6, 6), with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
+    """Return the matrix ad(d) (6, 6), with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
     small = np.zeros((6, 6))
     turn, shift = skew(tangent[:3]), skew(tangent[3:])
     for i in range(3):
@@ -98,7 +98,7 @@ def _small_adjoint(tangent: Float) -> Float:
 
 
 def _missing(undetermined: Float, axes: Float, turning_rad: Float) -> list[str]:
-    """Describe what is not determined, and what to do."""
+    """Return sentences on the undetermined directions, and what to do about them."""
     if not len(undetermined):
         return []
     turns = np.rad2deg(turning_rad)
@@ -127,13 +127,13 @@ def _missing(undetermined: Float, axes: Float, turning_rad: Float) -> list[str]:
 
 
 def _directions(parts: Float) -> Float:
-    """Orthonormal basis (K, 3) of the space that vectors (N, 3) generate, without directions that are small."""
+    """Return an orthonormal basis (K, 3) of the space of vectors (N, 3), without directions of small components."""
     _, sizes, rows = np.linalg.svd(parts)
     return np.asarray(rows[: int(np.sum(sizes > 0.3))])
 
 
 def _named(axis: Float) -> str:
-    """Name an axis after the camera's, or by its coordinates."""
+    """Return the name of an axis: that of the nearest camera axis, or its coordinates."""
     nearest = int(np.argmax(np.abs(axis)))
     if abs(axis[nearest]) > _ALONG:
         return _AXES[nearest]

@@ -1,4 +1,4 @@
-"""Calibration of two pairs from the motion that each measures, by the paper's method and by a graph (section 4)."""
+"""Calibration of two pairs from the motions that each measures, by the paper's method and by a graph (section 4)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from graphvio.calibration.validation import Grown, Halves, alignment_lengths, di
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
 SYSTEMATIC_POSE_COVARIANCE = np.diag(np.repeat([4e-5, 1.5e-4], 3) ** 2)
-"""Covariance (6, 6) of a camera's pose as its images see it: a fiftieth of a pixel, and what that is at the distance of
-a wall. All motions of a camera share this error, so no recording makes it smaller."""
+"""Covariance (6, 6) of the systematic error of a camera's pose by its images: a fiftieth of a pixel, and its effect at
+the distance of a wall. All motions of a camera share this error, so no recording makes it smaller."""
 
 _MAX_OUTLIERS = 0.5
 _SCALE_ROUNDS = 3
@@ -29,19 +29,19 @@ _SCALE_ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class PairCalibration:
-    """The relative pose of two pairs, and how it was found."""
+    """The relative pose of two pairs, with the data and checks of its estimation."""
 
-    solution: GraphSolution  # the graph's
-    pairs: PosePairs  # N pose pairs that it was found from
-    frames: PosePairs  # M pose pairs from each instant to the next, as the paper's
+    solution: GraphSolution  # solution of the graph
+    pairs: PosePairs  # N pose pairs from which it was found
+    frames: PosePairs  # M pose pairs from each instant to the next, as in the paper
     paper_left2_T_left1: Float  # (4, 4) by the paper's method
-    comparison: Comparison  # of both methods
+    comparison: Comparison  # comparison of both methods
     dispersion: float  # factor on the solution's covariance, see `validation.dispersion`
     scale: ScaleCheck  # ratio of the lengths that both measure
-    scale_estimated: bool  # whether lengths of the second pair were corrected by it
-    nuisances: Nuisances  # variables that were estimated, too
+    scale_estimated: bool  # whether lengths of the second pair were corrected by this ratio
+    nuisances: Nuisances  # nuisance variables that were estimated as well
     floor: Float  # (6, 6) covariance of systematic errors, which is part of `covariance`
-    seed: int  # of the random triples, and of the bootstrap
+    seed: int  # seed of the random triples and of the bootstrap
 
     @property
     def left2_T_left1(self) -> Float:
@@ -65,12 +65,12 @@ class PairCalibration:
 
     @cached_property
     def halves(self) -> Halves | None:
-        """First half of the recording against the second; None where one does not determine the pose."""
+        """Comparison of the recording's two halves; None where one does not determine the pose."""
         return halves(self.pairs, self.solution, self.dispersion, self.nuisances, self.floor)
 
     @cached_property
     def resampled_covariance(self) -> Float:
-        """Covariance (6, 6) of the solution by a bootstrap."""
+        """Covariance (6, 6) of the solution, estimated by a bootstrap."""
         return self._resampled[:6, :6]
 
     @cached_property
@@ -85,7 +85,7 @@ class PairCalibration:
 
     @cached_property
     def growth(self) -> tuple[Grown, ...]:
-        """Solutions from longer and longer beginnings of the recording, with dispersion and systematic errors."""
+        """Solutions from growing parts of the recording, from its beginning; with dispersion and systematic errors."""
         return tuple(
             each._replace(covariance=self.dispersion * each.covariance + self.floor)
             for each in growth(self.pairs, self.solution, self.nuisances)
@@ -93,7 +93,7 @@ class PairCalibration:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on everything that a user should know before using the result; empty if all is well."""
+        """Sentences on everything that a user should know before using the result; empty if there is nothing."""
         sentences = list(self.observability.missing)
         if self.scale.is_wrong and not self.scale_estimated:
             return tuple(sentences)  # a wrong scale makes all of the following fail
@@ -149,9 +149,9 @@ def calibrate_pair(
     """Calibrate two pairs.
 
     Args:
-        segments: of two cameras, all that may be chosen from.
-        seed: of the random triples, and of the bootstrap.
-        nuisances: variables to estimate, too, with derivatives for all segments.
+        segments: all segments of two cameras from which pose pairs may be chosen.
+        seed: seed of the random triples and of the bootstrap.
+        nuisances: nuisance variables to estimate as well, with derivatives for all segments.
         scale_mode: ``estimate`` the ratio of the second camera's lengths to the first's as a variable, keep it
             ``fixed`` at 1, or ``auto``: estimate it where it differs significantly from 1.
         systematic_pose_covariance: covariance (6, 6) of each camera's pose as its images see it.
@@ -192,7 +192,7 @@ def calibrate_pair(
 
 
 def _check_scale(pairs: PosePairs, start: Float, nuisances: Nuisances) -> ScaleCheck:
-    """Estimate the ratio of lengths by the graph; in several rounds, as its effect is linear only for small ones."""
+    """Estimate the ratio of lengths by the graph, in several rounds, as its effect is linear only near 1."""
     log_ratio, checked = 0.0, ScaleCheck(0.0, np.inf)
     for _ in range(_SCALE_ROUNDS):
         corrected = rescaled(pairs, log_ratio)

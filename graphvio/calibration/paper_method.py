@@ -1,12 +1,12 @@
-"""The paper's calibration of P_12 (section 4), step by step, and what makes it robust to noise.
+"""The paper's calibration of P_12 (section 4), step by step, with additions that make it robust to noise.
 
 ``P_12 P_1(k) = P_2(k) P_12`` gives eq. (5) for the rotation and eq. (6) for the translation. RANSAC over minimal sets
 of three pose pairs finds the rotation as an eigenvector, eq. (8) and (9), then the translation by least squares, eq.
 (10); Levenberg-Marquardt minimises the alignment error, eq. (7), on the inliers.
 
 The paper does not say how solutions are compared, and takes the best one as it is. Here their costs weigh the alignment
-errors by the covariances of the motions, the ten best are refined on their inliers, and directions in which rotations
-determine nothing beyond their noise are left out.
+errors by the covariances of the motions, the ten best are refined on their inliers, and directions in which the
+rotations do not exceed their noise are left out.
 
 ``R_1, T_1`` and ``R_2, T_2`` are the paper's: ``P_j(k)`` maps points from the start to the end of a motion.
 """
@@ -28,8 +28,8 @@ from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, 
 _TRIPLES = 500
 _CANDIDATES = 10  # best triples, which are refined before one is chosen
 _LIMIT = float(chdtri(3, 1e-3))
-_TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs has errors of its own
-_MIN_TURN, _MAX_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
+_TRIPLE_LIMIT = 9.0 * _LIMIT  # larger, as a solution from three pose pairs has an error itself
+_MIN_TURN, _MAX_TURN = np.deg2rad([0.2, 170.0])  # limits for a pose pair in a triple: both signs of q fit a half turn
 _MIN_TURNED = 3.0  # rms rotation about an axis over the noise of a rotation
 _ROUNDS = 5
 _ITERATIONS = 50
@@ -55,7 +55,7 @@ class PoseParts(NamedTuple):
         return PoseParts(*parts)
 
     def select(self, rows: Bool | Int) -> PoseParts:
-        """Return some of them, by mask or indices."""
+        """Return the parts of some pose pairs, by mask or indices."""
         return PoseParts(*(part[rows] for part in self))
 
 
@@ -68,7 +68,7 @@ class PaperSolution:
 
 
 def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
-    """Calibrate by RANSAC, with a seed of its random triples, then Levenberg-Marquardt on the inliers.
+    """Calibrate by RANSAC, whose random triples have a seed, then by Levenberg-Marquardt on the inliers.
 
     Raises:
         CalibrationError: with fewer than three pose pairs, without rotation, or if no solution explains three of them.
@@ -92,8 +92,8 @@ def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:
     """Find R(q) as an eigenvector, eq. (8) and (9).
 
     Args:
-        R_1: (N, 3, 3) of the first camera.
-        R_2: (N, 3, 3) of the second camera.
+        R_1: (N, 3, 3) rotations of the first camera.
+        R_2: (N, 3, 3) rotations of the second camera.
 
     Returns:
         R(q) (3, 3), and the eigenvalues (4,) of ``C^T C`` in ascending order; the second is zero where the rotations do
@@ -107,8 +107,8 @@ def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
     """Find T (3,) by least squares, eq. (10), see `translations`; the shortest one where it is not unique.
 
     Args:
-        R: (3, 3).
-        parts: of N pose pairs.
+        R: (3, 3) rotation.
+        parts: parts of N pose pairs.
         noise_rad: standard deviation of a rotation; axes with no more rotation than this explains are left out.
     """
     return np.asarray(translations(R[None], PoseParts(*(part[None] for part in parts)), noise_rad)[0])
@@ -121,11 +121,11 @@ def translations(R: Float, parts: PoseParts, noise_rad: float) -> Float:
 
     Args:
         R: (M, 3, 3) rotations.
-        parts: of N pose pairs each, (M, N, ...).
+        parts: parts of N pose pairs for each set, (M, N, ...).
         noise_rad: standard deviation of a rotation, see `translation`.
 
     Returns:
-        (M, 3), metres.
+        Translations (M, 3), metres.
     """
     A = (np.eye(3) - parts.R_2).reshape(len(R), -1, 3)
     # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
@@ -199,18 +199,18 @@ def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tupl
 
 
 def _turned_axes(parts: PoseParts, noise_rad: float) -> Float:
-    """Orthonormal directions (3, K), in left1, in which the rotations determine t."""
+    """Return the orthonormal directions (3, K), in left1, in which the rotations determine t."""
     _, sizes, right = np.linalg.svd((np.swapaxes(parts.R_1, 1, 2) - np.eye(3)).reshape(-1, 3), full_matrices=False)
     return np.asarray(right[sizes > _min_singular_value(sizes, len(parts.R_1), noise_rad)].T)
 
 
 def _min_singular_value(sizes: Float, count: int, noise_rad: float) -> float:
-    """Smallest singular value of N rotations, less the identity, that noise does not explain."""
+    """Return the smallest singular value of N rotations less the identity that noise does not explain."""
     return max(_MIN_TURNED * noise_rad * float(np.sqrt(count)), _TINY * float(sizes[0]))
 
 
 class _Weighted:
-    """Pose pairs whose alignment errors are weighted by the motions' covariances."""
+    """Pose pairs, with alignment errors that are weighted by the motions' covariances."""
 
     def __init__(self, pairs: PosePairs) -> None:
         self.parts = PoseParts.of(pairs)
@@ -222,17 +222,17 @@ class _Weighted:
         self._covariance_2 = R_2 @ pairs.covariance_2[:, 3:, 3:] @ np.swapaxes(R_2, 1, 2)
 
     def distances(self, R: Float, t: Float) -> Float:
-        """Squared Mahalanobis distances (N,) of the alignment errors from zero."""
+        """Return squared Mahalanobis distances (N,) of the alignment errors from zero."""
         errors = alignment_errors_of(self.parts.R_1, self.parts.T_1, self._moved, R, t)
         return squared_lengths_of(errors, self.parts.R_1, self._covariance_1, self._covariance_2, R, t)
 
     def costs(self, R: Float, t: Float, limit: float) -> Float:
-        """Sum the `distances`, each up to a limit: (M,) for M solutions."""
+        """Return the sums (M,) of the `distances`, each truncated at a limit, for M solutions."""
         return np.array([np.minimum(self.distances(*each), limit).sum() for each in zip(R, t, strict=True)])
 
 
 def _best_triples(weighted: _Weighted, rng: np.random.Generator) -> list[tuple[Float, Float]]:
-    """Rotations and t of the triples with the lowest cost, the best first."""
+    """Return rotations and t by the triples with the lowest cost, the best first."""
     parts, turns = weighted.parts, weighted.turns
     normals = _normal_matrices(parts.R_1, parts.R_2)
     fit = np.flatnonzero((turns > _MIN_TURN) & (turns < _MAX_TURN))
@@ -251,7 +251,7 @@ def _best_triples(weighted: _Weighted, rng: np.random.Generator) -> list[tuple[F
 
 
 def _refined_on_inliers(weighted: _Weighted, R: Float, t: Float) -> tuple[float, Float, Float]:
-    """Alternate between inliers and solution until the inliers stay the same; the first value is the final cost."""
+    """Alternate between inliers and solution until the inliers stay the same; return the cost, R and t."""
     before = None
     for number in range(_ROUNDS):
         inlier = weighted.distances(R, t) < (_TRIPLE_LIMIT if number == 0 else _LIMIT)
@@ -266,7 +266,7 @@ def _refined_on_inliers(weighted: _Weighted, R: Float, t: Float) -> tuple[float,
 
 
 def _normal_matrices(R_1: Float, R_2: Float) -> Float:
-    """``C_k^T C_k`` (N, 4, 4) of eq. (9); with Hamilton's product eq. (5) reads ``q q_1 = q_2 q``.
+    """Return ``C_k^T C_k`` (N, 4, 4) of eq. (9); with Hamilton's product eq. (5) reads ``q q_1 = q_2 q``.
 
     Quaternions with a positive real part have signs that agree, as both rotations turn by the same angle.
     """
@@ -276,7 +276,7 @@ def _normal_matrices(R_1: Float, R_2: Float) -> Float:
 
 
 def _product_matrices(quats_wxyz: Float, side: Literal["left", "right"]) -> Float:
-    """Matrices (N, 4, 4) of the product with quaternions from the left or from the right."""
+    """Return the matrices (N, 4, 4) of the product with quaternions from the left or from the right."""
     sign = 1.0 if side == "left" else -1.0
     made = np.empty((len(quats_wxyz), 4, 4))
     w, v = quats_wxyz[:, 0], quats_wxyz[:, 1:]
@@ -286,7 +286,7 @@ def _product_matrices(quats_wxyz: Float, side: Literal["left", "right"]) -> Floa
 
 
 def _crosses(vectors: Float) -> Float:
-    """Matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    """Return the matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
     x, y, z = vectors.T
     zero = np.zeros(len(vectors))
     return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

@@ -1,4 +1,4 @@
-"""Motions that two rigidly joined cameras made at the same time."""
+"""Pose pairs: motions of two rigidly joined cameras over the same time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_inverse, se3_log
 
 MIN_PAIRS = 3
-"""Pose pairs that the paper's method needs."""
+"""Number of pose pairs that the paper's method needs."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The result of a calibration: poses of all pairs, how far the rig file is from them, and the corrected rig."""
+"""The result of a calibration: poses of all pairs, their difference from the rig file, and the corrected rig."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ _CHANCE = 1e-3
 _SIGNIFICANT = 4.0  # sigmas of a drift of clocks
 _TINY = 1e-300
 _COARSE_RAD, _COARSE_M = np.deg2rad(0.5), 0.01
-_NEARER = 20  # steps to the nearest of equally likely poses
+_NEARER = 20  # iterations towards the nearest of equally likely poses
 _MAX_UNDETERMINED = 0.01  # share of undetermined directions in a value that counts as known
 _SWAPPED = 0.2  # distance of the rig's inverse over that of the rig's value
 
 
 @dataclass(frozen=True, eq=False)
 class RigComparison:
-    """A pair's pose in the rig file against the calibration, in the directions that the motions determine."""
+    """Comparison of a pair's pose in the rig file with the calibration, in directions that the motions determine."""
 
     tangent: Float  # (6,) from the calibration to the file's ``left2_T_left1``, ``[rotation, translation]`` in left1
-    sigmas: float  # its significance, as a number of standard deviations of one normal variable
+    sigmas: float  # significance of the difference, as a number of standard deviations of one normal variable
     is_off: bool  # whether chance does not explain it
     is_swapped: bool  # whether the file would be right if both pairs changed places
     is_partial: bool = False  # whether the motions determine only a part of the pose, so that sigmas are approximate
 
     @property
     def reliability(self) -> str:
-        """Suffix for a sentence on its size."""
+        """Suffix for a sentence on the size of the difference."""
         return " as far as the motions determine it" if self.is_partial else f" ({self.sigmas:.1f} sigma)"
 
     @property
@@ -67,7 +67,7 @@ class PoseSummary:
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """A camera's clock relative to another one's."""
+    """A camera's clock relative to that of another camera."""
 
     relation: ClockRelation  # offset and drift
     offset_sigma_s: float  # standard deviation of the offset
@@ -84,10 +84,10 @@ class Calibration:
     """The poses of all stereo pairs, or of cameras with trajectories, on a rig.
 
     Attributes:
-        names: of J pairs or cameras.
-        places: poses of all, with the results for two at a time.
+        names: names of J pairs or cameras.
+        places: poses of all pairs or cameras, with the results for two at a time.
         rig: the rig that was calibrated; None for trajectories.
-        imu: pair -> its left camera against the IMU, where both could be compared.
+        imu: pair -> alignment of its left camera with the IMU, where both could be compared.
         clocks: (first, second) -> relation of their clocks, for trajectories.
         warnings: sentences on everything that a user should know before using the result.
     """
@@ -101,7 +101,7 @@ class Calibration:
 
     @property
     def pair(self) -> PairCalibration:
-        """The calibration of the first two alone, with all details."""
+        """The calibration of the first two pairs or cameras alone, with all details."""
         return self.places.pairwise[0, 1]
 
     @property
@@ -155,7 +155,7 @@ class Calibration:
             j: index of the pair, from 1.
 
         Returns:
-            How far both are apart, or None without a rig.
+            Their difference, or None without a rig.
         """
         if self.rig is None:
             return None
@@ -175,7 +175,7 @@ class Calibration:
         return self.places.pairwise[0, j].observability.undetermined
 
     def _apart(self, j: int, given: Float) -> tuple[Float, float, int]:
-        """Return tangent (6,) to another value where determined, squared Mahalanobis distance, degrees of freedom."""
+        """Return the determined part of the tangent (6,) to a pose, its squared Mahalanobis length and dimension."""
         undetermined = self._undetermined(j)
         place = np.ascontiguousarray(self.places.left_T_left1[j])
         for _ in range(_NEARER):  # all poses along these directions are equally likely: take the nearest one
@@ -223,7 +223,7 @@ class Calibration:
 
 
 def rig_warnings(found: Calibration) -> list[str]:
-    """Describe what is wrong with the rig file, a sentence each."""
+    """Return sentences on what is wrong with the rig file."""
     sentences = []
     for j in range(1, len(found.names)):
         rig = found.compare_rig(j)

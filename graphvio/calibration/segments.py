@@ -1,4 +1,4 @@
-"""Segments of a recording over which cameras' motions make pose pairs, and the choice of those that are used.
+"""Segments of a recording over which motions of cameras form pose pairs, and the selection of those that are used.
 
 A motion over one frame is small and noisy; over a second it is larger, but so is its error. Every instant belongs to at
 most one of the chosen segments, so that no noise is counted twice.
@@ -42,7 +42,7 @@ class Segments:
 
     @property
     def cameras(self) -> int:
-        """J."""
+        """Number J of cameras."""
         return int(self.known.shape[1])
 
     def select(self, rows: Bool | Int) -> Segments:
@@ -50,7 +50,7 @@ class Segments:
         return Segments(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def of_both(self, one: int, other: int) -> Segments:
-        """Return the segments over which two cameras know their motions, of these two cameras in this order."""
+        """Return the segments over which the motions of two cameras are known, for these two in this order."""
         both = self.select(self.known[:, one] & self.known[:, other])
         columns = [one, other]
         return replace(
@@ -120,22 +120,22 @@ def of_one_length(segments: Segments) -> Int:
 
 
 def information_gains(pairs: PosePairs, left2_T_left1: Float, covariance: Float) -> Float:
-    """Compute by how much each of N pose pairs lowers the logarithm of the solution's uncertainty volume, (N,).
+    """Compute the decrease (N,) of the logarithm of the solution's uncertainty volume by each of N pose pairs.
 
-    To first order, about an approximate solution (4, 4) with its covariance (6, 6).
+    It is computed to first order, about an approximate solution (4, 4) with its covariance (6, 6).
     """
     _, jacobians = whitened(pairs, left2_T_left1)
     return np.asarray(np.einsum("nki,ij,nkj->n", jacobians, covariance, jacobians))
 
 
 def most_informative(segments: Segments, gains: Float) -> Int:
-    """Return indices, in order of time, of the segments that do not overlap with the largest sum of gains (N,)."""
+    """Return indices, in order of time, of the non-overlapping segments with the largest sum of gains (N,)."""
     ending: dict[int, list[int]] = {}
     for row, j in enumerate(segments.last.tolist()):
         ending.setdefault(j, []).append(row)
     first = segments.first.tolist()
     count = int(segments.last.max(initial=0)) + 1
-    best = np.zeros(count)  # largest sum of segments that end by then
+    best = np.zeros(count)  # largest sum of gains of segments that end by then
     by: list[int | None] = [None] * count
     for j in range(1, count):
         best[j] = best[j - 1]

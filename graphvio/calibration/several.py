@@ -22,7 +22,7 @@ _CHANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Results for two cameras at a time, chained around three cameras; without errors the chain is the identity."""
+    """A chain of results for two cameras at a time around three cameras; without errors it is the identity."""
 
     cameras: tuple[int, int, int]  # their indices
     error: Float  # (6,) tangent ``[rotation, translation]`` in the first of the three
@@ -41,7 +41,7 @@ class CameraExtrinsics:
     left_T_left1: Float  # (J, 4, 4) pose of the first left camera in each; the first is the identity
     covariance: Float  # (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1
     pairwise: Mapping[tuple[int, int], PairCalibration]  # (first, second) -> result for these two alone
-    loops: tuple[Loop, ...]  # of three cameras; empty for two cameras
+    loops: tuple[Loop, ...]  # loops of three cameras; empty for two cameras
     # (first, second) -> squared Mahalanobis distance (6 degrees of freedom) of the result for all cameras from that for
     # these two alone, by the latter's covariance
     distances: Mapping[tuple[int, int], float]
@@ -51,7 +51,7 @@ class CameraExtrinsics:
 def pairwise(
     names: Sequence[str], calibrate: Callable[[int, int, ScaleMode], PairCalibration], scale_mode: ScaleMode
 ) -> tuple[dict[tuple[int, int], PairCalibration], list[str]]:
-    """Calibrate all cameras, two at a time; where one scale is significantly wrong, all are estimated.
+    """Calibrate all cameras, two at a time; if one scale is significantly wrong, the scales of all are estimated.
 
     Returns:
         (first, second) -> result, and a sentence on each result that is missing.
@@ -87,8 +87,8 @@ def place_all(
 
     Args:
         found: results for two cameras at a time, including those of the first camera and each other one.
-        names: of J cameras.
-        segments: of J cameras, all that may be chosen from.
+        names: names of J cameras.
+        segments: all segments of J cameras that may be chosen.
         systematic_pose_covariance: covariance (6, 6) of each camera's pose as its images see it.
 
     Raises:
@@ -144,7 +144,7 @@ def _rescaled(segments: Segments, found: Mapping[tuple[int, int], PairCalibratio
 
 
 def _gains(segments: Segments, found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
-    """Information gains (N,) of segments, summed over all cameras."""
+    """Return the information gains (N,) of segments, summed over all cameras."""
     gains = np.zeros(len(segments))
     for j in range(1, count):
         both = segments.known[:, 0] & segments.known[:, j]
@@ -154,7 +154,7 @@ def _gains(segments: Segments, found: Mapping[tuple[int, int], PairCalibration],
 
 
 def _systematic(left_T_left1: Float, systematic_pose_covariance: Float) -> Float:
-    """Covariance of all poses due to the cameras' systematic errors; that of the first camera is common to all."""
+    """Return the covariance of all poses by the cameras' systematic errors; the first camera's is common to all."""
     others = len(left_T_left1) - 1
     covariance = np.tile(systematic_pose_covariance, (others, others))
     for j in range(others):
@@ -164,7 +164,7 @@ def _systematic(left_T_left1: Float, systematic_pose_covariance: Float) -> Float
 
 
 def _undetermined(found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
-    """Covariance of all poses in directions that the motions do not determine."""
+    """Return the covariance of all poses in directions that the motions do not determine."""
     covariance = np.zeros((6 * (count - 1), 6 * (count - 1)))
     for j in range(1, count):
         each = found[0, j]
@@ -174,7 +174,7 @@ def _undetermined(found: Mapping[tuple[int, int], PairCalibration], count: int) 
 
 
 def _in_first_lengths(found: Mapping[tuple[int, int], PairCalibration], one: int, other: int) -> Float:
-    """Calibrate ``left_other_T_left_one`` (4, 4) of two cameras alone, in lengths of the first camera."""
+    """Return ``left_other_T_left_one`` (4, 4) by these two cameras alone, in lengths of the first camera."""
     place = np.array(found[one, other].left2_T_left1)
     if one and found[0, one].scale_estimated:
         place[:3, 3] *= np.exp(-found[0, one].scale.log_ratio)

@@ -22,12 +22,12 @@ from graphvio.calibration.validation import dispersion
 from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.trajectory import Trajectory
 
-_MAX_GAP_S = 0.25  # between two poses, over which a trajectory is interpolated
+_MAX_GAP_S = 0.25  # longest time between two poses over which a trajectory is interpolated
 _MIN_PERIOD_NS = 19_500_000  # somewhat less than 20 ms, as stamps may be rounded
 _INITIAL_SIGMAS = np.repeat([3e-3, 6e-3], 3)  # radians and metres
 _MIN_SIGMA = 1e-6
 _NORMAL_MEDIAN = 1.4826  # sigma of a normal distribution over its median of absolute values
-_MAX_NOISE_SHARE = 2e-3  # of the variance of the rotation about the second axis
+_MAX_NOISE_SHARE = 2e-3  # of noise in the mean square of the rotation about the second axis
 _ROUNDS = 5
 _STEP_NS = 5_000_000
 _OFFSET_SIGMA_S, _DRIFT_SIGMA = 0.05, 1e-4  # a priori: seconds, seconds per second
@@ -35,7 +35,7 @@ _NS_PER_S = 1_000_000_000
 
 
 def segments_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelation]) -> Segments:
-    """List segments of J trajectories, with equal initial covariances; clocks are relative to that of the first."""
+    """List segments of J trajectories, with equal initial covariances; ``clocks`` are relative to the first clock."""
     stamps = _thinned(trajectories[0].stamps_ns)
     sampled = [_at(trajectories[0], stamps)]
     sampled += [_at(each, clock.of(stamps)) for each, clock in zip(trajectories[1:], clocks, strict=True)]
@@ -52,13 +52,13 @@ def segments_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelati
 class TwoTrajectories:
     """Segments of two trajectories, ready for calibration."""
 
-    segments: Segments  # with covariances estimated from residuals
+    segments: Segments  # segments with covariances estimated from residuals
     clock: ClockRelation  # refined together with the relative pose
     nuisances: Nuisances | None  # corrections of its offset, seconds, and drift; None for one clock
 
 
 def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: int = 0) -> TwoTrajectories:
-    """Alternate between the relation of the clocks, unless both have one, the noise and the relative pose.
+    """Estimate the noise, the relative pose and, unless both have one clock, the clocks' relation, in alternation.
 
     Raises:
         CalibrationError: if no offset makes their angular speeds agree, or no relative pose explains their motions.
@@ -82,7 +82,7 @@ def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: 
 
 
 def of_all(trajectories: Sequence[Trajectory], two: Mapping[tuple[int, int], TwoTrajectories]) -> Segments:
-    """List segments of J trajectories by the clock of the first, each with the mean of its noise in pairwise ones."""
+    """List segments of J trajectories on the first one's clock; their noise is the mean of that by two at a time."""
     segments = segments_of(trajectories, [two[0, j].clock for j in range(1, len(trajectories))])
     length = _length_classes(segments)
     noise: dict[tuple[int, int], list[Float]] = {}  # camera, length -> covariances
@@ -101,7 +101,7 @@ def of_all(trajectories: Sequence[Trajectory], two: Mapping[tuple[int, int], Two
 
 
 def _long_enough(segments: Segments) -> Segments:
-    """Drop lengths over which the rig rotates too little against the noise.
+    """Drop segments of lengths over which the rig rotates too little compared with the noise.
 
     Noise in a motion's rotation looks like rotation that has no effect, and so biases the offset between the cameras
     towards zero, by the share of the rotation's mean square that is noise.
@@ -118,7 +118,7 @@ def _long_enough(segments: Segments) -> Segments:
 
 
 def _with_noise(segments: Segments, left2_T_left1: Float) -> Segments:
-    """Set covariances of two cameras: each has half of that of the residuals of segments of the same length."""
+    """Set covariances of two cameras: half of the residuals' covariance each, by the length of segments."""
     pairs = segments.pairs
     residuals = errors_of(left2_T_left1, pairs.motion_1, pairs.motion_2)
     adjoint = se3_adjoint(se3_inverse(left2_T_left1))
@@ -133,7 +133,7 @@ def _with_noise(segments: Segments, left2_T_left1: Float) -> Segments:
 
 
 def _scatter(segments: Segments, left2_T_left1: Float) -> float:
-    """Factor on the noise of segments of one length, as an odometry's errors are correlated over time."""
+    """Return a factor on the noise of segments of one length, as an odometry's errors are correlated over time."""
     pairs = segments.select(of_one_length(segments)).pairs
     errors, jacobians = whitened(pairs, left2_T_left1)
     within = np.sum(errors**2, axis=1) <= LIMIT
@@ -141,13 +141,13 @@ def _scatter(segments: Segments, left2_T_left1: Float) -> float:
 
 
 def _length_classes(segments: Segments) -> Int:
-    """Index (N,) of the element of `LENGTHS_S` that each segment is nearest to."""
+    """Return the index (N,) of the element of `LENGTHS_S` that is nearest to each segment's duration."""
     lengths_s = (segments.end_ns - segments.start_ns) / _NS_PER_S
     return np.asarray(np.argmin(np.abs(lengths_s[:, None] - np.array(LENGTHS_S)), axis=1))
 
 
 def _robust_covariance(residuals: Float) -> Float:
-    """Covariance (6, 6) of residuals (N, 6) with outliers: one sigma for rotations and one for translations."""
+    """Return a robust covariance (6, 6) of residuals (N, 6): one sigma for rotations and one for translations."""
     rotation, translation = (np.median(np.abs(residuals[:, part])) for part in (slice(0, 3), slice(3, 6)))
     sigmas = _NORMAL_MEDIAN * np.repeat([rotation, translation], 3)
     return np.diag(np.maximum(sigmas, _MIN_SIGMA) ** 2)
@@ -156,7 +156,7 @@ def _robust_covariance(residuals: Float) -> Float:
 def _clock_nuisances(
     one: Trajectory, other: Trajectory, clock: ClockRelation, segments: Segments, left2_T_left1: Float
 ) -> Nuisances:
-    """Offset and drift as nuisance variables, with numerical derivatives."""
+    """Return offset and drift as nuisance variables, with numerical derivatives."""
     back, ahead = (
         _errors(one, other, clock.corrected(sign * _STEP_NS / _NS_PER_S, 0.0), segments, left2_T_left1)
         for sign in (-1.0, 1.0)
@@ -172,7 +172,7 @@ def _clock_nuisances(
 def _errors(
     one: Trajectory, other: Trajectory, clock: ClockRelation, segments: Segments, left2_T_left1: Float
 ) -> Float:
-    """Errors (N, 6) of the same segments under another relation of the clocks; NaN beyond the end of a trajectory."""
+    """Return errors (N, 6) of the same segments with another relation of the clocks; NaN beyond a trajectory's end."""
     stamps = _thinned(one.stamps_ns)
     poses, known = _at(other, clock.of(stamps))
     motion_2 = inverses(poses)[segments.first] @ poses[segments.last]
@@ -191,7 +191,7 @@ def _thinned(stamps_ns: Int) -> Int:
 
 
 def _at(trajectory: Trajectory, stamps_ns: Int) -> tuple[Float, Bool]:
-    """Poses (N, 4, 4) at stamps (N,), the identity where unknown, and a mask (N,) of known ones."""
+    """Return poses (N, 4, 4) at stamps (N,), the identity where unknown, and a mask (N,) of known ones."""
     found, known = trajectory.at(stamps_ns, _MAX_GAP_S)
     poses = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
     poses[known] = found.nav_T_body

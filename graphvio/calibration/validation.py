@@ -1,4 +1,4 @@
-"""Checks of a calibration: one half of the recording against the other, a bootstrap, growth, and dispersion."""
+"""Checks of a calibration: comparison of the recording's halves, bootstrap, growing recordings, and dispersion."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from graphvio.geometry import se3_inverse, se3_log
 
 _BLOCK_S = 5.0
 _MIN_BLOCKS = 4
-_MIN_BLOCK_INFORMATION = 1e-6  # of the largest: directions of which a block has less are left out
+_MIN_BLOCK_INFORMATION = 1e-6  # relative to the largest: directions with less information in a block are left out
 _RESAMPLES = 200
-_MIN_INFORMATION = 1e-12  # of the largest: less counts as none
+_MIN_INFORMATION = 1e-12  # relative to the largest: less counts as none
 _GROWTH_POINTS = 8
 _CHANCE = 1e-3
 _NS_PER_S = 1e9
@@ -31,10 +31,10 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Solutions from a recording's first and second half."""
+    """The solutions from a recording's first and second half."""
 
     own_m: tuple[float, float]  # mean alignment error of inliers by the half's own solution, first and second half
-    crossed_m: tuple[float, float]  # by the other half's solution
+    crossed_m: tuple[float, float]  # the same by the other half's solution
     difference: Float  # (6,) tangent from the first half's solution to the second's
     covariance: Float  # (6, 6) of the difference, if the cameras did not move on the rig
 
@@ -50,7 +50,7 @@ class Halves:
 
 
 class Grown(NamedTuple):
-    """The solution from the beginning of a recording."""
+    """The solution from a first part of a recording."""
 
     end_ns: int  # end of the part that is used
     left2_T_left1: Float  # (4, 4)
@@ -60,13 +60,13 @@ class Grown(NamedTuple):
 def halves(
     pairs: PosePairs, solution: GraphSolution, factor: float, nuisances: Nuisances, floor: Float
 ) -> Halves | None:
-    """Solve for each half alone; None where one does not determine the pose.
+    """Compare the solutions from each half alone; None where one half does not determine the pose.
 
     Args:
         pairs: N pose pairs.
-        solution: from all pose pairs.
-        factor: on the covariances of both solutions.
-        nuisances: variables that are estimated, too.
+        solution: solution from all pose pairs.
+        factor: factor on the covariances of both solutions.
+        nuisances: nuisance variables that are estimated as well.
         floor: (6, 6) covariance of systematic errors of each solution.
     """
     middle = np.median(pairs.end_ns)
@@ -91,7 +91,7 @@ def halves(
 def resampled(pairs: PosePairs, solution: GraphSolution, nuisances: Nuisances, seed: int) -> Float:
     """Estimate the covariance (6 + M, 6 + M) of pose and nuisance variables by a bootstrap over blocks of some seconds.
 
-    Blocks keep what neighbouring motions have in common (H. R. Künsch, *The Jackknife and the Bootstrap for General
+    Blocks preserve the correlation of neighbouring motions (H. R. Künsch, *The Jackknife and the Bootstrap for General
     Stationary Observations*, 1989). Each sample takes one Gauss-Newton step from the solution.
     """
     rng = np.random.default_rng(seed)
@@ -113,7 +113,7 @@ def resampled(pairs: PosePairs, solution: GraphSolution, nuisances: Nuisances, s
 
 
 def growth(pairs: PosePairs, solution: GraphSolution, nuisances: Nuisances) -> tuple[Grown, ...]:
-    """Solve for longer and longer beginnings of the recording, those that determine the pose."""
+    """Solve for increasing parts of the recording, from its beginning; omit those that do not determine the pose."""
     begin, end = int(pairs.start_ns[0]), int(pairs.end_ns[-1])
     grown = []
     for share in 2.0 ** -np.arange(_GROWTH_POINTS - 1, -1, -1.0):
@@ -132,11 +132,11 @@ def dispersion(pairs: PosePairs, errors: Float, jacobians: Float, determined: Fl
     more than its covariance allows; the excess is the factor, R. T. Birge's ratio of external to internal errors.
 
     Args:
-        pairs: N pose pairs that the solution is from.
-        errors: (N, 6) whitened, at the solution.
-        jacobians: (N, 6, M) of the errors.
+        pairs: N pose pairs from which the solution was found.
+        errors: (N, 6) whitened errors at the solution.
+        jacobians: (N, 6, M) derivatives of the errors.
         determined: (K, M) orthonormal directions of the unknowns that the pose pairs determine.
-        chance: of a factor above 1 for consistent covariances.
+        chance: probability of a factor above 1 for consistent covariances.
 
     Returns:
         The factor; 1 where chance explains the excess.
@@ -165,7 +165,7 @@ def alignment_lengths(pairs: PosePairs, left2_T_left1: Float) -> Float:
 
 
 def _blocks(pairs: PosePairs) -> Int:
-    """Numbers (N,) of the blocks that pose pairs lie in; blocks are shorter where there would be too few."""
+    """Return the number (N,) of the block of each pose pair; blocks are shorter where there would be too few."""
     if not len(pairs):
         return np.zeros(0, dtype=np.int64)
     since_s = (pairs.start_ns - pairs.start_ns[0]) / _NS_PER_S

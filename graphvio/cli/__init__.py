@@ -32,7 +32,7 @@ from graphvio.version import __version__
 
 app = typer.Typer(
     name="graphvio",
-    help="Visual-inertial odometry for rigs of several stereo pairs.",
+    help="Visual-inertial odometry for rigs of stereo pairs and single cameras.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # rich alone takes 0.1 s to import

@@ -1,4 +1,4 @@
-"""Many sessions, each optimised by itself, in parallel on Dask's workers."""
+"""Optimisation of many sessions, each by itself, in parallel on Dask's workers."""
 
 import logging
 
@@ -6,9 +6,10 @@ from graphvio.runtime import ignore_interrupts, set_up_threads
 
 
 def dask_setup(worker: object) -> None:
-    """Set up a worker process of this machine; Dask calls it in modules that it preloads.
+    """Set up a worker process on this machine; Dask calls it in modules that it preloads.
 
-    Interrupts are left to the process that started the workers, and warnings on recordings to the results.
+    Interrupts are left to the process that started the workers; warnings on recordings are not logged, as the results
+    have them.
     """
     ignore_interrupts()
     set_up_threads()

@@ -1,4 +1,4 @@
-"""Dask's workers: a cluster on this machine, or an existing one."""
+"""Connection to Dask's workers: a cluster on this machine, or an existing one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def distributed() -> Any:
 
 
 def default_workers() -> int:
-    """Return the number of processes for this machine: one for two cores, and at least two.
+    """Return the number of worker processes for this machine: one per two cores, and at least two.
 
     The odometry keeps about two cores busy, a thread for each pair and one that decodes; the other stages keep one or
     two. With two processes, one works while the other is restarted or waits for the disk.
@@ -41,7 +41,7 @@ def default_workers() -> int:
 def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) -> None:
     """Compile the odometry's kernels in this process, before several processes would all compile the same.
 
-    Without a rig, that of the first recording that can be opened here is used.
+    Without a rig, the rig of the first recording that can be opened here is used.
     """
     for recording in (Path(each) for each in recordings if rig is None):
         if recording.exists():
@@ -55,9 +55,10 @@ def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) 
 
 @contextmanager
 def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any]:
-    """Connect a client to the scheduler at an address, and disconnect it at the end.
+    """Connect a client to the scheduler at an address, and disconnect it at the end of the context.
 
-    Without an address, it is that of a cluster on this machine for the time inside, of so many processes of one thread.
+    Without an address, a cluster is started on this machine, and ended with the context; it has ``workers`` processes
+    of one thread each.
 
     Raises:
         FleetError: if the scheduler cannot be reached, or the cluster cannot be started.

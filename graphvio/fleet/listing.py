@@ -1,4 +1,4 @@
-"""Sessions in a folder, or in a list."""
+"""Listing of the sessions in a folder, or in a text file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graphvio.sources import is_recording
 class Listed:
     """A session of a fleet run."""
 
-    name: str  # unique name, that of its folder of results
+    name: str  # unique name, which is also that of its folder of results
     recording: str  # absolute path, or URL
 
 
@@ -28,7 +28,7 @@ def list_sessions(where: str) -> list[Listed]:
     or .db3.
 
     Raises:
-        FleetError: if it does not exist, or has no recording.
+        FleetError: if the folder or list does not exist, or has no recording.
     """
     local = local_path(where)
     try:

@@ -18,9 +18,9 @@ class Marker:
     """A finished stage."""
 
     stage: str  # name, such as ``odometry`` or ``features-0-of-2``
-    inputs: Mapping[str, str]  # name -> value, of all that determines the results
+    inputs: Mapping[str, str]  # name -> value of everything that determines the results
     files: Sequence[str]  # names of its files in the session's folder
-    wall_s: float  # wall time, fetching and putting included
+    wall_s: float  # wall time, including the transfer of files
     figures: Mapping[str, Any] = field(default_factory=dict)  # name -> value, for the table of sessions
 
     def write(self, storage: Storage) -> None:
@@ -30,7 +30,9 @@ class Marker:
 
 
 def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
-    """Return the stages of a session whose files all exist, of the inputs that are known: name -> marker.
+    """Return the finished stages of a session whose files all exist: name -> marker.
+
+    ``inputs`` are those that are known without opening the recording.
 
     Raises:
         FleetError: if the folder cannot be read, or holds results of other inputs.
@@ -55,7 +57,7 @@ def forget(storage: Storage, stage: str) -> None:
 
 
 def refuse_others(storage: Storage, markers: Iterable[Marker], inputs: Mapping[str, str]) -> None:
-    """Raise a `FleetError` unless stages were made from the same inputs."""
+    """Raise a `FleetError` unless the markers' stages were made from the same inputs."""
     for marker in markers:
         differing = [key for key, value in inputs.items() if marker.inputs.get(key) != value]
         if differing:

@@ -1,4 +1,4 @@
-"""Many sessions through all stages, by Dask's workers; a failed session affects no other."""
+"""Run of many sessions through all stages on Dask's workers; a failed session does not affect the others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graphvio.sources.reading import Reading
 PLACES_PER_TASK = 200
 """Places whose features one task extracts: about 80 m of a walk, and about ten seconds of work."""
 
-_PRIORITY = {tasks.ODOMETRY: 0, "features": 1, tasks.LOOPS: 2, tasks.GRAPH: 3}  # first what was begun
+_PRIORITY = {tasks.ODOMETRY: 0, "features": 1, tasks.LOOPS: 2, tasks.GRAPH: 3}  # sessions that were begun come first
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class FleetProgress:
 
     sessions: int  # number of sessions
     optimized: int  # sessions with results
-    failed: int  # sessions given up
-    tasks: int  # tasks that have ended in this run, failed ones included
-    latest: str  # stage and session of the task that ended last; empty before the first
+    failed: int  # sessions that were given up
+    tasks: int  # tasks that have ended in this run, including failed ones
+    latest: str  # stage and session of the task that ended last; empty before the first has
 
 
 Progress = Callable[[FleetProgress], None]
@@ -53,7 +53,7 @@ def optimize_fleet(
     places_per_task: int = PLACES_PER_TASK,
     on_progress: Progress | None = None,
 ) -> list[Outcome]:
-    """Optimise each session by itself, and write a table of all.
+    """Optimise each session by itself, and write a table of all sessions.
 
     A task that fails, or whose worker dies, is done again up to twice; then its session is given up. When called again
     with the same arguments, only missing stages are done.
@@ -66,14 +66,14 @@ def optimize_fleet(
         with_loops: whether loop closures are searched, which needs the extra ``maps``.
         calibrates: whether the graphs have extrinsics and time offset as variables, see
             `graphvio.optimization.pipeline.optimize_sessions`.
-        reading: what is read of each recording; None for all of it.
+        reading: which part of each recording is read; None for all of it.
         scheduler: address of a Dask scheduler; None takes workers on this machine.
         workers: processes on this machine; None takes `default_workers`.
         places_per_task: maximum number of places whose features one task extracts.
-        on_progress: called at first and whenever a task has ended.
+        on_progress: called at the beginning and whenever a task has ended.
 
     Returns:
-        The outcome of each session, in their order.
+        The outcome of each session, in the order of ``sessions``.
 
     Raises:
         FleetError: if the scheduler or the folder of results cannot be reached.
@@ -116,7 +116,7 @@ class _Session:
 
     job: tasks.Job  # the session to optimise
     markers: dict[str, Marker] = field(default_factory=dict)  # stage -> marker, of finished stages
-    parts_left: int = 0  # tasks of features that have not ended
+    parts_left: int = 0  # number of feature tasks that have not ended
     failed_in: str = ""  # stage in which it was given up, or empty
     error: str = ""  # its error in one line, or empty
 
@@ -139,7 +139,7 @@ class _Session:
 
 
 class _Fleet:
-    """Submits the stages of all sessions, each when those before it have ended."""
+    """Submits the stages of all sessions as tasks, each when the stages before it have ended."""
 
     def __init__(self, sessions: Sequence[_Session], on_progress: Progress | None) -> None:
         self.sessions = sessions
@@ -157,7 +157,7 @@ class _Fleet:
             except GraphvioError as error:
                 session.failed_in, session.error = tasks.ODOMETRY, _one_line(error)
             if not session.error and not session.is_optimized:
-                session.markers.pop(tasks.GRAPH, None)  # its inputs are made again
+                session.markers.pop(tasks.GRAPH, None)  # its inputs will be made again
                 waiting.append(session)
         self._report("")
         return waiting

@@ -1,4 +1,4 @@
-"""Files that fsspec reaches: local folders, S3, GCS and others, by paths or URLs."""
+"""Access to files by path or URL with fsspec: local folders, S3, GCS and others."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def file_system(url: str) -> tuple[Any, str]:
     """Return the file system of a path or URL, and the path in it.
 
     Raises:
-        FleetError: if the kind of URL is unknown, or what it needs is not installed.
+        FleetError: if the kind of URL is unknown, or a package that it needs is not installed.
         MissingExtraError: if the extra ``fleet`` is not installed.
     """
     with importing("fsspec", "fleet", "working on many sessions"):
@@ -43,7 +43,7 @@ def local_path(url: str) -> Path | None:
 
 @contextmanager
 def reaching() -> Iterator[None]:
-    """Raise what S3's client says of the network or credentials as an `OSError`, as fsspec does elsewhere."""
+    """Raise errors of S3's client on network or credentials as an `OSError`, as fsspec does for other storage."""
     try:
         yield
     except Exception as error:
@@ -53,7 +53,7 @@ def reaching() -> Iterator[None]:
 
 
 class Storage:
-    """A folder of results, local or remote, made with its first file; a `FleetError` says what cannot be reached."""
+    """A folder of results, local or remote, made with its first file; methods raise a `FleetError` if they fail."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
@@ -61,7 +61,7 @@ class Storage:
         self._local = local_path(self.url)
 
     def sizes(self) -> dict[str, int]:
-        """Return name -> bytes, of all files in it and in folders below."""
+        """Return the sizes of all files in the folder and in folders below: name -> bytes."""
         with self._reaching(self.url, "read"):
             self._files.invalidate_cache()
             try:
@@ -108,7 +108,7 @@ class Storage:
         return f"{self._root.rstrip('/')}/{name}"
 
     def _replace(self, name: str, fill: Callable[[str], None]) -> None:
-        """Fill a file under another name, and move it."""
+        """Write a file under a temporary name with ``fill``, and move it to its name."""
         path = self._path(name)
         folder, _, file = path.rpartition("/")
         unfinished = f"{folder}/.{file}.{uuid.uuid4().hex[:8]}{_UNFINISHED}"
@@ -142,10 +142,10 @@ class Storage:
 
 
 def fetch_recording(url: str, scratch: Path) -> Path:
-    """Return the local path of a recording, or of a copy in a folder that keeps the recording fetched last.
+    """Return the local path of a recording, or of a copy in ``scratch``, which keeps the recording fetched last.
 
     Raises:
-        FleetError: if it does not exist, cannot be read or does not fit on the disk.
+        FleetError: if the recording does not exist, cannot be read or does not fit on the disk.
     """
     local = local_path(url)
     if local is not None:

@@ -25,10 +25,10 @@ class Outcome:
 
     name: str  # session name
     recording: str  # path or URL
-    figures: Mapping[str, Any]  # name -> value or None, of the finished stages
+    figures: Mapping[str, Any]  # name -> value or None, from the finished stages
     wall_s: Mapping[str, float]  # stage -> wall time of its tasks, in the run that executed them
     failed_in: str  # stage that failed, or empty
-    error: str  # its error in one line, or empty
+    error: str  # error of that stage in one line, or empty
 
     @property
     def status(self) -> str:

@@ -1,4 +1,4 @@
-"""The stages of one session as tasks: each fetches its inputs, works in a folder of its own, and puts its results.
+"""The stages of one session as tasks: each fetches its inputs, works in a folder of its own, and stores its results.
 
 A task that is finished already, by an earlier run or by a worker that was taken for dead, returns the same marker.
 Partial results of an interrupted task are overwritten when it is done again, or removed when the session is finished.
@@ -36,8 +36,8 @@ from graphvio.version import __version__
 
 ODOMETRY, LOOPS, GRAPH = "odometry", "loops", "graph"
 
-_ONE_AT_A_TIME = threading.Lock()  # the odometry has threads of its own, and recordings share a place
-_STATE = "stages.json"  # of a folder that one process works in from the first stage to the last
+_ONE_AT_A_TIME = threading.Lock()  # the odometry has threads of its own, and fetched recordings share a folder
+_STATE = "stages.json"  # written by `Workspace` for a folder in which one process runs all stages; not stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Job:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """Name -> value, of all that determines the results and is known without opening the recording."""
+        """Name -> value of everything that determines the results and is known without opening the recording."""
         return {
             "recording": self.recording,
             "config": self.config.sha256(),
@@ -75,7 +75,7 @@ def features_stage(part: int, parts: int) -> str:
 
 
 def odometry(job: Job) -> Marker:
-    """Run the odometry; its figures are those of the summary, and ``parts``, the number of tasks for features."""
+    """Run the odometry; the marker's figures are from the summary, and ``parts``, the number of feature tasks."""
 
     def work(task: _Task) -> dict[str, Any]:
         if task.stages.calibrates_first:
@@ -99,7 +99,7 @@ def odometry(job: Job) -> Marker:
 
 
 def features(job: Job, part: int, parts: int) -> Marker:
-    """Extract the features of one part of the places into a database of its own."""
+    """Extract the features of one part of the places into a separate database."""
 
     def work(task: _Task) -> dict[str, Any]:
         task.fetch(ODOMETRY)
@@ -127,7 +127,7 @@ def loops(job: Job, parts: int) -> Marker:
             for part in range(parts):
                 with FeatureDatabase(task.folder / _part_name(part, parts)) as database:
                     merge_places(database, whole, session.name, session.rig, stamps)
-        forget(task.storage, GRAPH)  # which adds to the database
+        forget(task.storage, GRAPH)  # as that stage adds to the database
         return {"loops_found": len(task.stages.closures([record]))}
 
     marker = _perform(job, LOOPS, work)
@@ -170,7 +170,11 @@ class _Task:
     fetched: set[str] = field(default_factory=set)
 
     def fetch(self, *stages: str) -> None:
-        """Fetch the files of earlier stages."""
+        """Fetch the files of earlier stages into the task's folder.
+
+        Raises:
+            FleetError: if the files of a stage do not exist any more.
+        """
         for stage in stages:
             if stage not in self.done:
                 raise FleetError(f"{self.job.results}: the files of {stage} are gone; run it again")
@@ -186,7 +190,7 @@ class _Task:
 
 
 def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], changed: Sequence[str] = ()) -> Marker:
-    """Do the work, unless it is done, and put the new files and those of the fetched ones that it changed."""
+    """Do the work, unless it is done already, and store its new files and the fetched ones in ``changed``."""
     begun = perf_counter()
     if job.version != __version__:
         raise FleetError(f"this worker has graphvio {__version__}, and was asked by {job.version}; install one version")
@@ -215,7 +219,7 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], chan
 
 @contextmanager
 def _scratch() -> Iterator[tuple[Path, Path]]:
-    """Return a folder that stays as long as the worker, if there is one, and a folder of this task alone."""
+    """Yield a folder that exists as long as the worker, if there is one, and a folder of this task alone."""
     try:
         with tempfile.TemporaryDirectory(prefix="graphvio-", dir=_worker_folder()) as own:
             scratch = Path(own) / "session"
@@ -239,7 +243,7 @@ def _part_name(part: int, parts: int) -> str:
 
 
 def _ate_m(trajectory: Path, truth: Path | None) -> float | None:
-    """Compute the rmse of the optimised trajectory, or return None without a truth that matches."""
+    """Compute the ATE rmse of the optimised trajectory; None without a true trajectory that matches."""
     if truth is None:
         return None
     try:

@@ -1,8 +1,8 @@
-"""Second motions that are none: tracks that were followed to what looks the same, such as the next row of bricks.
+"""Removal of false second motions, caused by tracks that jumped to the next repetition of a texture.
 
-Where the predicted motion is far off, neighbouring tracks are all followed to the next repetition of a texture. They
-then agree on a motion of their own, as the points of an object that moves do. But their patches are also where the
-motion of the others has them, which an object's are not.
+If the predicted motion is far off, neighbouring tracks may all be followed to a place that looks the same, such as the
+next row of bricks. They then agree on a motion of their own, as the points of a moving object do. But unlike an
+object's, their keyframe patches are also found where the motion of the other tracks predicts them.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from graphvio.geometry import se3_inverse
 def without_lookalikes(
     agreement: Agreement, seen: TrackedFrameset, trackers: Sequence[GroupTracker], body_T_left: Float
 ) -> Agreement:
-    """Leave out the hypotheses whose points are where the first one has them, too.
+    """Leave out the motion hypotheses whose points are also seen where the first hypothesis predicts them.
 
-    Unless its own points are also where they have them: then either may be right.
+    A hypothesis is kept if the first one's points are also seen where it predicts them: then either may be right.
 
     Args:
-        agreement: of the frameset's motion.
-        seen: the frameset.
-        trackers: of all groups, at this frameset.
-        body_T_left: (P, 4, 4) of their left cameras.
+        agreement: the motion hypotheses of the frameset.
+        seen: the tracks of the frameset.
+        trackers: the trackers of all groups, at this frameset.
+        body_T_left: (P, 4, 4) poses of the groups' left cameras in body.
     """
     best, *others = agreement.hypotheses
 
     def share(one: MotionHypothesis, other: MotionHypothesis) -> float:
-        """Return the share of one's points that are where the other has them, too."""
+        """Return the share of the points of ``one`` that are also seen where the motion of ``other`` predicts them."""
         there = 0
         for j, ids in seen.correspondences.identities(seen.frames, one.refined.inlier).items():
             left_T_left = se3_inverse(body_T_left[j]) @ other.refined.cur_T_ref @ body_T_left[j]

@@ -1,4 +1,8 @@
-"""Velocities by which rolling shutters are compensated: where a motion shows them, and what their errors do to it."""
+"""Velocities of body by which rolling shutters are compensated, measured by vision, and the effect of their errors.
+
+The compensation of a frameset needs the velocity at its stamp. Where no state estimator knows it, it is computed from
+the measured motions, and the frameset's motion is measured again.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +24,10 @@ _UNKNOWN_SIGMA_M_S = 0.5
 
 
 class Readouts:
-    """Motions of body by which the rolling shutters of the newest frameset and of the references are compensated.
+    """Keeps the motions of body by which rolling shutters are compensated: of the newest frameset and the references.
 
     Args:
-        rig: with rolling shutters.
+        rig: the rig, with rolling-shutter cameras.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -32,13 +36,13 @@ class Readouts:
         self._applied: dict[int, ReadoutMotion] = {}  # by stamp
 
     def keep(self, seen: TrackedFrameset, references: References) -> None:
-        """Remember the motion of a frameset, which may become a reference, and forget those that are none."""
+        """Store the readout motion of a frameset, which may become a reference; drop those that no reference needs."""
         self._applied = {ns: each for ns, each in self._applied.items() if ns in references.stamps_ns}
         if seen.readout is not None:
             self._applied[seen.stamp_ns] = seen.readout
 
     def note(self, seen: TrackedFrameset, cur_T_ref: Float) -> None:
-        """Note a motion (4, 4), which shows velocities."""
+        """Add the measured motion ``cur_T_ref`` (4, 4) of a frameset, from which velocities are computed."""
         now, then = seen.readout, self._applied.get(seen.reference_stamp_ns)
         by_imu = _by_imu(now), _by_imu(then)
         self._measured.note(seen.reference_stamp_ns, seen.stamp_ns, se3_inverse(cur_T_ref), by_imu)
@@ -46,16 +50,16 @@ class Readouts:
     def compensated_by_motion(
         self, seen: TrackedFrameset, trackers: list[GroupTracker], references: References, rig: Rig
     ) -> TrackedFrameset | None:
-        """Compensate a frameset and its reference by the velocities that motions have shown, if none are known.
+        """Compensate a frameset and its reference again, by velocities computed from measured motions.
 
         Args:
-            seen: the frameset.
-            trackers: of all groups, whose newest frames change.
-            references: change, too.
-            rig: with the calibration that is in force.
+            seen: the tracks of the frameset.
+            trackers: the trackers of all groups; their newest frames are changed.
+            references: the reference frames; those of the frameset's reference are changed.
+            rig: the rig, with the calibration that is in force.
 
         Returns:
-            The frameset, or None where velocities are known, or motions do not show them.
+            The frameset, compensated again, or None where both velocities are known already, or cannot be computed.
         """
         if is_velocity_known(seen.readout) and is_velocity_known(self._applied.get(seen.reference_stamp_ns)):
             return None
@@ -71,14 +75,14 @@ class Readouts:
     def errors(
         self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
     ) -> ByVelocities:
-        """Return how a motion depends on the velocities.
+        """Return the derivatives of a motion with respect to the velocities, and the velocities with covariances.
 
         Args:
-            seen: the frameset.
-            arrays: of the rig.
-            inlier: (N,) points that the motion is of.
-            cur_T_ref: (4, 4).
-            noise_px: of a pixel.
+            seen: the tracks of the frameset.
+            arrays: the calibration of the rig.
+            inlier: (N,) the points that the motion explains.
+            cur_T_ref: (4, 4) the motion of body.
+            noise_px: standard deviation of the pixel noise.
         """
         seconds, observations = self._line_seconds(seen), seen.correspondences.observations
         derivatives = derivatives_by_velocities(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
@@ -92,7 +96,7 @@ class Readouts:
         return ByVelocities(used, derivatives, covariances)
 
     def _line_seconds(self, seen: TrackedFrameset) -> Float:
-        """Return the times (2, N) from the stamp until each point's line was exposed, now and at the reference."""
+        """Return the seconds (2, N) from the stamp until each point's line was exposed, now and at the reference."""
         parts = []
         for j, rows in sorted(seen.correspondences.rows.items()):
             frame, reference = seen.frames[j], seen.reference[j]
@@ -102,7 +106,7 @@ class Readouts:
 
 
 def is_velocity_known(readout: ReadoutMotion | None) -> bool:
-    """Whether a velocity by which rolling shutters are compensated is known, and not only a guess."""
+    """Return whether the velocity by which rolling shutters are compensated is known, and not only a guess."""
     return readout is not None and readout.velocity_covariance is not None
 
 

@@ -1,4 +1,4 @@
-"""The framesets that motion is measured from: the previous one, or keyframes while enough of them is in view."""
+"""Reference framesets, from which motion is measured: the previous one, or a keyframe while enough of it is in view."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _T = THRESHOLDS.reference
 
 
 class References:
-    """Each pair's reference frame, and the decision when to take a new one."""
+    """Holds each pair's reference frame, and decides when it is replaced."""
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -34,21 +34,21 @@ class References:
         return self._frames.get(pair)
 
     def replace(self, frames: Mapping[int, TrackedFrame]) -> None:
-        """Use frames as their pairs' references from now on."""
+        """Set the reference frames of some pairs: pair index -> tracks."""
         self._frames.update(frames)
 
     def recalibrate(self, rig: Rig) -> None:
-        """Use another calibration of the rig: the references' points are triangulated again."""
+        """Take another calibration of the rig, and triangulate the references' points again."""
         self._frames = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._frames.items()}
 
     def read_out(self, stamp_ns: int, readout: ReadoutMotion, rig: Rig) -> None:
-        """Compensate the rolling shutters of the references of one stamp by another motion of body."""
+        """Compensate the rolling shutters of the references that have a stamp by another motion of body."""
         for j, frame in self._frames.items():
             if frame.stamp_ns == stamp_ns and rig.groups[j].left.line_time_us:
                 self._frames[j] = as_at_stamp(frame, rig.groups[j], readout)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget the references of all pairs."""
         self._frames.clear()
 
     def forget(self, pair: int) -> None:
@@ -56,7 +56,7 @@ class References:
         self._frames.pop(pair, None)
 
     def shared(self, frames: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:
-        """Return reference frames of one stamp: where pairs have different ones, that with most tracks in common."""
+        """Return the pairs' reference frames of one stamp: if they differ, the one with the most tracks in common."""
         groups: dict[int, dict[int, TrackedFrame]] = {}
         for j in frames:
             if j in self._frames:
@@ -72,11 +72,11 @@ class References:
     def must_be_replaced(
         self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
     ) -> bool:
-        """Decide whether the next motions are measured from the newest frames, after a motion.
+        """Decide, after a motion was measured, whether the newest frames have to replace the references.
 
         Args:
             frames: Newest frame of each pair.
-            correspondences: Points of them that the references have, too.
+            correspondences: Points that both these frames and the references have.
             inlier: (N,) The points that the motion explains.
         """
         return int(inlier.sum()) < _T.min_points or self._have_lost_points(frames, correspondences, inlier)
@@ -84,13 +84,14 @@ class References:
     def must_be_replaced_after_few(
         self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
     ) -> bool:
-        """Decide the same after a frameset whose points were too few for a motion.
+        """Decide the same after a frameset with too few points for a motion.
 
-        The keyframe goes on while they are seen, and the newest frames could not measure a motion either.
+        The keyframe goes on while its points are in view and the newest frames do not have enough points with depth for
+        a motion either.
 
         Args:
             frames: Newest frame of each pair.
-            correspondences: Points of them that the references have, too.
+            correspondences: Points that both these frames and the references have.
             inlier: (N,) The points that agree with the prediction.
         """
         newest = sum(int(frame.has_depth.sum()) for frame in frames.values())
@@ -99,10 +100,10 @@ class References:
     def _have_lost_points(
         self, frames: Mapping[int, TrackedFrame], correspondences: Correspondences, inlier: Bool
     ) -> bool:
-        """Return whether too few of the references' points are still seen, against then or the newest frames.
+        """Return whether too few of the references' points are still seen, by their number then or in the new frames.
 
-        A pair that the motion does not explain at all, such as one with a crowd in front of it, does not end the
-        keyframe of the others.
+        With the previous frameset as reference, the answer is always True. A pair none of whose points the motion
+        explains, such as one with a crowd in front of it, does not end the keyframe of the others.
         """
         if self._config.reference == "previous":
             return True
@@ -124,7 +125,7 @@ class References:
         return False
 
     def _share_of_near_points(self, seen: Mapping[int, Int]) -> float:
-        """Return the share of the references' near points that are still seen (pair index -> identities).
+        """Return the share of the references' near points that are among those still seen (pair index -> identities).
 
         Far points stay in view for long, but do not constrain the translation.
         """

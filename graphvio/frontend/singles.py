@@ -1,4 +1,4 @@
-"""The front-end of a rig of single cameras: tracks of each camera, and keyframes; motion is the back-end's."""
+"""The front-end of a rig of single cameras: it tracks and chooses keyframes; the back-end measures the motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graphvio.timing import timed
 
 _MIN_PARALLAX = 0.01  # median displacement of rays since a keyframe: with less, the rig has not moved
 _MAX_PARALLAX = 0.06  # with more, a keyframe is due
-_KEYFRAMES_AHEAD = 2.0  # what leaves a view until then is handed over
+_KEYFRAMES_AHEAD = 2.0  # tracks that leave a camera's view within so many keyframes are handed over
 _MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to predict tracks by
 
 
@@ -30,24 +30,29 @@ class SinglesFrontend(TrackingFrontend):
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         super().__init__(rig, config, image_mask)
-        self._of_file = [single.left for single in rig.singles]  # by whose lenses rays are measured
+        self._of_file = [single.left for single in rig.singles]  # the cameras by whose lenses rays are computed
         self._overlaps = Overlaps(rig, config)
         self._handover = Handover(len(rig.singles))
 
     def recalibrate(self, rig: Rig, epipolar_margin_px: float) -> None:
-        """Track and match by another calibration of the same cameras from the next frameset on.
+        """Track and match with another calibration of the same cameras from the next frameset on.
 
-        What is measured stays rays by the lenses of the rig file, from which the back-end estimates the calibration.
+        The rays in the results are still computed by the lenses of the rig file: from them the back-end estimates the
+        calibration.
 
         Args:
-            rig: with the calibration.
-            epipolar_margin_px: by how much its epipolar lines may be off, added to what matches may be off.
+            rig: the rig, with the new calibration.
+            epipolar_margin_px: by how much its epipolar lines may be off, pixels; added to the largest epipolar error
+                of a match.
         """
         self._recalibrate(rig, epipolar_margin_px, {})
         self._overlaps.recalibrate(rig, epipolar_margin_px)
 
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
-        """Find the tracks in all cameras; what they show of the motion, the back-end measures."""
+        """Return the tracks of all cameras and their matches in other cameras, and begin a keyframe if one is due.
+
+        The motion is measured by the back-end.
+        """
         is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
         reports = {j: _report(frame) for j, frame in seen.frames.items()}
         is_keyframe = not self._all_frozen and self._is_keyframe(
@@ -72,7 +77,7 @@ class SinglesFrontend(TrackingFrontend):
         )
 
     def _advance_history(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> None:
-        """Note the predicted motion since the keyframe before, by which the new one locates points."""
+        """Store the predicted motion since the last keyframe, from which depths at the new keyframe are computed."""
         reference = next(iter(seen.reference.values()), None)
         cur_T_reference = None if reference is None else motion_since(reference.stamp_ns)
         if reference is not None and cur_T_reference is not None:
@@ -82,7 +87,11 @@ class SinglesFrontend(TrackingFrontend):
     def _begin_keyframe(
         self, seen: TrackedFrameset, motion_since: MotionPredictor
     ) -> tuple[TrackedFrameset, dict[int, CameraTracks]]:
-        """Register later tracks on these images, with handed over and new ones, which other cameras may see, too."""
+        """Make the frameset a keyframe: add handed-over tracks and new corners, and match these in other cameras.
+
+        Returns:
+            The frameset with all its tracks, and camera index -> its tracks.
+        """
         before = seen.frames
         seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
         new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
@@ -98,7 +107,14 @@ class SinglesFrontend(TrackingFrontend):
     ) -> dict[int, CameraTracks]:  # fmt: skip
         """Find each camera's tracks in the other cameras that see the same part of the scene.
 
-        Those that another camera's track is a part of are found by that one.
+        Between keyframes, tracks that were handed over are left out while the original camera still follows the point:
+        the original track is matched instead.
+
+        Args:
+            seen: tracks of the frameset.
+            motion_since: predicts the motion since an earlier stamp.
+            searches: whether tracks without an earlier match are searched for, as at keyframes.
+            wanted: camera index -> (N,) which of its tracks to match; None for all.
         """
         frames = seen.frames
         images = {j: self._trackers[j].tracked_image for j in frames}
@@ -121,7 +137,7 @@ class SinglesFrontend(TrackingFrontend):
 
     @timed("handover")
     def _handed_over(self, frames: dict[int, TrackedFrame]) -> dict[int, TrackedFrame]:
-        """Let cameras follow the points of tracks that are about to leave the others' views."""
+        """Let cameras follow the points of tracks that are about to leave another camera's view."""
         leaving = {j: self._leaving(j, frame) for j, frame in frames.items()}
         adopted = dict(frames)
         for j, frame in sorted(frames.items()):
@@ -130,7 +146,7 @@ class SinglesFrontend(TrackingFrontend):
         return adopted
 
     def _leaving(self, camera: int, frame: TrackedFrame) -> Leaving:
-        """Return the tracks that leave a camera's view soon, if they go on as since the last keyframe."""
+        """Return the tracks that will soon leave a camera's view if they move on as since the last keyframe."""
         reference = self._references.of(camera) or TrackedFrame.empty()
         then, now = common_rows(reference.ids, frame.ids)
         ahead = frame.pixels[now] + _KEYFRAMES_AHEAD * (frame.pixels[now] - reference.pixels[then])
@@ -143,7 +159,10 @@ class SinglesFrontend(TrackingFrontend):
     def _is_keyframe(
         self, stamp_ns: int, frames: dict[int, TrackedFrame], motion_since: MotionPredictor, is_stationary: bool
     ) -> bool:
-        """Decide whether later tracks are registered on these images, and a state of the window stays."""
+        """Decide whether the frameset becomes a keyframe.
+
+        Later tracks are registered on a keyframe's images, and its state stays in the back-end's window.
+        """
         references = {j: reference for j in frames if (reference := self._references.of(j)) is not None}
         if len(references) < len(frames):
             return True
@@ -152,7 +171,7 @@ class SinglesFrontend(TrackingFrontend):
         common = {j: common_rows(references[j].ids, frame.ids) for j, frame in frames.items()}
         if self._lost_sight(references, common):
             return True
-        if not any(len(then) for then, _ in common.values()):  # the reference is of the dark, and has no tracks to lose
+        if not any(len(then) for then, _ in common.values()):  # the reference was taken in the dark: no tracks to lose
             return any(len(frame.ids) for frame in frames.values())
         parallax, since_ns, is_predicted = self._parallax(frames, references, common, motion_since)
         if not is_predicted:
@@ -160,7 +179,7 @@ class SinglesFrontend(TrackingFrontend):
         return parallax > _MAX_PARALLAX
 
     def _lost_sight(self, references: Mapping[int, TrackedFrame], common: Mapping[int, tuple[Int, Int]]) -> bool:
-        """Whether too few tracks of the references go on: in any camera, or in all together."""
+        """Return whether too few tracks of the references are still followed, in any camera or in all together."""
         min_overlap = self._config.motion.keyframe_overlap
         min_share = min_overlap * THRESHOLDS.reference.min_pair_share
         overlaps = {j: len(then) for j, (then, _) in common.items()}
@@ -175,11 +194,11 @@ class SinglesFrontend(TrackingFrontend):
         common: Mapping[int, tuple[Int, Int]],
         motion_since: MotionPredictor,
     ) -> tuple[float, int, bool]:
-        """Compute by how much rays have moved since the references, beside what a predicted rotation moves them.
+        """Compute by how much rays have moved since the references, apart from the predicted rotation.
 
         Returns:
-            Their median displacement, the stamp of the reference that the rotation is predicted from, and whether it is
-            predicted at all.
+            The median displacement in normalised coordinates, the stamp of the reference since which the rotation is
+            predicted, and whether it is predicted at all.
         """
         displacements = []
         since_ns, cur_T_reference = 0, None
@@ -199,6 +218,6 @@ class SinglesFrontend(TrackingFrontend):
 
 
 def _report(frame: TrackedFrame) -> PairReport:
-    """Report a camera's tracks, all of which count as inliers: the back-end decides."""
+    """Return a report of a camera's tracks, in which all count as inliers: the back-end finds the outliers."""
     n = len(frame.ids)
     return PairReport(n, n, frame.pixels, np.ones(n, dtype=bool), frame.ages, frame.rejected)

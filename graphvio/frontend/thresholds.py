@@ -14,20 +14,27 @@ from scipy.special import chdtri
 
 @dataclass(frozen=True)
 class AgreementThresholds:
-    """When pairs agree on one motion, and when a second one is looked for (`graphvio.frontend.pairs.agreement`).
+    """When pairs agree on one motion, and when a second one is searched for (`graphvio.frontend.pairs.agreement`).
 
     Attributes:
-        max_distance: Squared Mahalanobis distance of motions that agree: normal errors exceed it once in 2 million.
-        max_distance_in_doubt: The same while the pairs contradicted each other a moment ago: once in 20.
-        doubt_ns: Time after a contradiction during which that holds.
-        max_searched_share: Share of a pair's points that the joint motion explains, below which it searches its own.
-        min_joint_share: From this share on, its own motion is refined from the joint one and its inliers.
-        min_rival_points: Points of a second motion.
-        min_unlike_px: Error of a point that may belong to it; less is a lens that is not quite known.
-        min_unexplained_share: Share of all points that are unexplained, from which on a second motion is looked for.
-        min_rival_share: Share of these that it has to explain.
-        min_comparable_support: Support, as a share of the best, from which on support alone does not decide.
-        min_lookalike_share: Share of points that are where another motion has them, too, of a motion that is none.
+        max_distance: Largest squared Mahalanobis distance of motions that agree; normal errors exceed it once in 2
+            million cases.
+        max_distance_in_doubt: The same shortly after the pairs contradicted each other; normal errors exceed it once in
+            20 cases.
+        doubt_ns: Time after a contradiction during which ``max_distance_in_doubt`` applies.
+        max_searched_share: Share of a pair's points that the joint motion explains; below it, the pair's own motion is
+            searched by RANSAC.
+        min_joint_share: Share of a pair's points that the joint motion explains; from it on, the pair's own motion is
+            refined from the joint one with its inliers.
+        min_rival_points: Smallest number of points of a second motion.
+        min_unlike_px: Smallest error, under the other motions, of a point that may belong to a second one; smaller
+            errors may come from a lens that is not exactly known.
+        min_unexplained_share: Share of all points that no motion explains, from which on a second one is searched for.
+        min_rival_share: Share of the unexplained points that the second motion has to explain.
+        min_comparable_support: Support, as a share of the best, from which on hypotheses are ordered by their pairs'
+            indices instead of their support.
+        min_lookalike_share: Share of a second motion's points that are also seen where the first one predicts them,
+            from which on the second motion is taken for a false one.
     """
 
     max_distance: float = 40.0
@@ -48,15 +55,18 @@ class QualityThresholds:
     """When a motion is weak, and by how much its covariance grows (`graphvio.frontend.motion.quality`).
 
     Attributes:
-        min_rival_share: Support of another hypothesis, as a share of the first, that makes it a possible one.
-        min_points: Fewer points may agree by chance.
+        min_rival_share: Support of another hypothesis, as a share of the first one's, from which on the covariance has
+            to cover it.
+        min_points: Number of points below which the covariance grows, since so few may agree by chance.
         max_usual_distance: Squared Mahalanobis distance between agreeing pairs beyond which the covariance grows.
-        min_stereo_share: Share of the corners that the right images must show as well; real ones show 16 % and more.
+        min_stereo_share: Smallest share of the corners that have to be found in the right images; real image pairs
+            reach 16 % and more.
         max_blur: Pixel noise over the modelled one, beyond which a motion is weak.
-        max_rotation_sigma_rad: Standard deviation in the weakest direction beyond which a motion is weak.
-        max_translation_sigma_m: The same of the translation.
-        possible_speeds: (6,) rad/s and m/s that a rig may have where images say next to nothing.
-        max_excess_speed_m_s: By how much faster than predicted a motion by single cameras alone may be.
+        max_rotation_sigma_rad: Standard deviation of the rotation in its weakest direction, beyond which a motion is
+            weak.
+        max_translation_sigma_m: The same for the translation.
+        possible_speeds: (6,) rad/s and m/s, speeds that a rig may have where images show next to nothing of its motion.
+        max_excess_speed_m_s: By how much a motion measured by single cameras alone may be faster than predicted.
     """
 
     min_rival_share: float = 0.1
@@ -77,10 +87,12 @@ class ReferenceThresholds:
     """When later motions are measured from a new frameset (`graphvio.frontend.references`).
 
     Attributes:
-        min_points: Points that the motion explains.
-        min_near_share: Share, of the configured overlap, of the near points that have to be still in view.
-        min_pair_share: Share, of the configured overlap, of a pair's tracks with depth that have to be usable points.
-        max_absence_ns: A pair that was absent for longer is tracked from scratch.
+        min_points: Smallest number of points that the motion explains; with fewer, the reference is replaced.
+        min_near_share: Smallest share of the near points that are still in view, as a factor of the configured
+            ``keyframe_overlap``.
+        min_pair_share: Smallest share of a pair's tracks with depth that are usable points, as a factor of the
+            configured ``keyframe_overlap``.
+        max_absence_ns: A pair without images for longer loses its tracks and its reference.
     """
 
     min_points: int = 20
@@ -94,16 +106,16 @@ class ExtrinsicThresholds:
     """When the extrinsics between two pairs are taken to be wrong (`graphvio.frontend.pairs.extrinsic_monitor`).
 
     Attributes:
-        max_motions: Motions over whole keyframes that are kept.
-        min_motions: Fewer do not decide.
-        iterations: Of Gauss-Newton.
+        max_motions: Number of motions over whole keyframes that are kept, the newest ones.
+        min_motions: Smallest number of motions from which an error is estimated.
+        iterations: Number of Gauss-Newton iterations.
         cauchy_scale: Squared scale of the robust cost of a motion's squared Mahalanobis distance.
-        max_outlier_share: Of the motions; with more, there is no common error.
-        prior_sigmas: (6,) rad and m: decides only in directions that no motion shows.
-        max_chance_distance: Chi-square that a right transform exceeds once in 10^9.
-        max_vague_share: A size is reported where its standard deviation is at most this share of it.
-        max_fine_rad: Or, of an angle, where it is at most this.
-        max_fine_m: Or, of a distance, where it is at most this.
+        max_outlier_share: Largest share of outliers among the motions; with more, there is no common error.
+        prior_sigmas: (6,) rad and m, of a prior on the error; it matters only in directions that no motion constrains.
+        max_chance_distance: Chi-square that exact extrinsics exceed once in 10^9 cases.
+        max_vague_share: Standard deviation of an angle or distance, as a share of it, up to which it is reported.
+        max_fine_rad: Standard deviation of an angle up to which it is reported in any case.
+        max_fine_m: Standard deviation of a distance up to which it is reported in any case.
     """
 
     max_motions: int = 100
@@ -123,11 +135,11 @@ class StandstillThresholds:
     """When images show a standstill (`graphvio.frontend.tracking.standstill`).
 
     Attributes:
-        max_median_px: Half of the points have not moved by more.
-        max_moved_px: Largest movement of a point that counts as unmoved.
-        min_unmoved_share: Share of the points that have to be unmoved.
-        min_points: Fewer do not decide.
-        min_duration_s: A slow motion does not show at once.
+        max_median_px: Movement that more than half of the points have to stay below.
+        max_moved_px: Movement below which a point counts as unmoved.
+        min_unmoved_share: Smallest share of unmoved points.
+        min_points: Smallest number of points from which a standstill is detected.
+        min_duration_s: Shortest time that this has to last, since a slow motion does not show at once.
     """
 
     max_median_px: float = 0.15

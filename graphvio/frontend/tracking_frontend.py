@@ -1,4 +1,4 @@
-"""What the front-ends of all rigs do: track every pair and single camera, and keep the frames to measure from."""
+"""Base class of the front-ends: it tracks every pair and single camera, and keeps the reference frames."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ _Result = TypeVar("_Result")
 
 
 class TrackedFrameset(NamedTuple):
-    """Tracks of a frameset.
+    """Tracks of a frameset, and of the reference from which its motion is measured.
 
     Attributes:
         stamp_ns: Stamp of the frameset.
-        frozen: Which images repeat.
-        frames: Pair index -> its tracks.
-        reference: Pair index -> its tracks at the reference; empty if there is none.
-        correspondences: Points of both.
-        readout: Motion of body by which rolling shutters are compensated, or None without these or if it is unknown.
+        frozen: Which images repeat the ones before.
+        frames: Pair index -> its tracks in this frameset.
+        reference: Pair index -> its tracks at the reference; empty if there is no reference.
+        correspondences: Points that have tracks both in this frameset and at the reference.
+        readout: Motion of body by which rolling shutters are compensated; None if it is unknown or there are none.
     """
 
     stamp_ns: int
@@ -57,17 +57,17 @@ class TrackedFrameset(NamedTuple):
 
     @property
     def reference_stamp_ns(self) -> int:
-        """Stamp of the reference, if there is one."""
+        """Stamp of the reference; there has to be one."""
         return next(iter(self.reference.values())).stamp_ns
 
 
 class TrackingFrontend(ABC):
-    """Tracks every pair and single camera, in as many threads as there are cores but one.
+    """Tracks every pair and single camera, in several threads: at most one fewer than there are cores.
 
     Args:
         rig: Stereo pairs and single cameras.
         config: Configuration of all stages.
-        image_mask: Masks of each image, or None.
+        image_mask: Function that makes a mask for each image, or None.
 
     Attributes:
         stage_ms: Processing time by stage of the newest frameset, milliseconds.
@@ -78,7 +78,7 @@ class TrackingFrontend(ABC):
         self._config = config
         self._rig = rig
         self._extrinsics = RigExtrinsics(rig, config)
-        self._histories = [MotionHistory() for _ in rig.groups]  # of each, since they may be triggered by themselves
+        self._histories = [MotionHistory() for _ in rig.groups]  # one each: groups may be triggered separately
         self._trackers = [
             GroupTracker(group, config, history, image_mask)
             for group, history in zip(rig.groups, self._histories, strict=True)
@@ -89,7 +89,7 @@ class TrackingFrontend(ABC):
         self._references = References(config.motion)
         self._standstill = Standstill()
         self._has_rolling_shutter = any(camera.line_time_us for camera in rig.cameras)
-        # One core is left to what else there is to do, such as to decode. Threads without one wait for each other.
+        # One core is left for other work, such as decoding images. Threads that share a core wait for each other.
         self._n_threads = max(1, min(len(rig.groups), usable_cores() - 1))
         self._workers = ThreadPoolExecutor(self._n_threads, thread_name_prefix="graphvio-pair")
 
@@ -105,8 +105,10 @@ class TrackingFrontend(ABC):
         Args:
             frameset: Images of any subset of pairs and single cameras.
             motion_since: The back-end's predicted motion since an earlier stamp, from which the search begins.
-            readout: Motion of body while rolling shutters read the images out; None continues that of the prediction.
-            rotation_since: The rotation by the gyro alone, from which the search begins where no motion is predicted.
+            readout: Motion of body while rolling shutters read the images out; if None, the predicted motion is taken
+                to continue.
+            rotation_since: The rotation since an earlier stamp by the gyro alone, from which the search begins where no
+                motion is predicted.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
@@ -117,7 +119,7 @@ class TrackingFrontend(ABC):
 
     @abstractmethod
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
-        """Measure what the tracks of a frameset show, and begin a keyframe if it is time for one."""
+        """Return the result for the tracks of a frameset, and begin a keyframe if one is due."""
 
     @property
     def reference_stamps_ns(self) -> frozenset[int]:
@@ -126,12 +128,12 @@ class TrackingFrontend(ABC):
 
     @property
     def body_T_left(self) -> Float:
-        """(P, 4, 4) of the groups' left cameras, with the corrections that are in force."""
+        """(P, 4, 4) poses of the groups' left cameras in body, with the corrections that are in force."""
         return self._extrinsics.arrays.body_T_left
 
     @property
     def extrinsic_errors(self) -> Mapping[int, ExtrinsicError]:
-        """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
+        """Errors of the extrinsics relative to the first pair, by group index; motions are corrected for them."""
         return self._extrinsics.extrinsic_errors
 
     def frames_at(self, stamp_ns: int) -> dict[int, TrackedFrame]:
@@ -139,12 +141,12 @@ class TrackingFrontend(ABC):
         return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
 
     def limit_corners(self, share: float) -> None:
-        """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for from now on."""
+        """Reduce the corners from now on to a share, above 0 and up to 1, of those that the configuration asks for."""
         for tracker in self._trackers:
             tracker.limit_corners(share)
 
     def start_keyframe(self) -> None:
-        """Measure the next motions from the newest frameset."""
+        """Make the newest frameset a keyframe, from which the next motions are measured."""
         self._references.clear()
         if not self._latest:
             return  # no image has come yet
@@ -152,16 +154,16 @@ class TrackingFrontend(ABC):
         self._refer_to({j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns})
 
     def drop(self, outliers: Mapping[int, Int]) -> None:
-        """Drop tracks that do not stand still: index of the pair or camera -> identities."""
+        """Drop the tracks of points that move in the world: index of the pair or single camera -> identities."""
         for j, ids in outliers.items():
             self._trackers[j].drop(ids)
 
     def close(self) -> None:
-        """End the threads."""
+        """Stop the worker threads."""
         self._workers.shutdown()
 
     def _recalibrate(self, rig: Rig, epipolar_margin_px: float, uncertain: Mapping[int, Float]) -> None:
-        """Track, match and locate by another calibration from now on; arguments as `VisualFrontend.recalibrate`."""
+        """Use another calibration from now on; for arguments see `VisualFrontend.recalibrate`."""
         self._rig = rig
         self._extrinsics.recalibrate(rig, uncertain)
         for tracker, group in zip(self._trackers, rig.groups, strict=True):
@@ -171,7 +173,7 @@ class TrackingFrontend(ABC):
         self._latest = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._latest.items()}
 
     def _move_trackers(self) -> None:
-        """Give the single cameras' trackers the poses by which they locate points."""
+        """Pass the poses of the single cameras to their trackers, which compute depths with them."""
         for j in range(len(self._rig.pairs), len(self._rig.groups)):
             self._trackers[j].move(self._extrinsics.arrays.body_T_left[j])
 
@@ -213,7 +215,7 @@ class TrackingFrontend(ABC):
         return TrackedFrameset(frameset.stamp_ns, frozen, frames, reference, correspond(reference, frames), readout)
 
     def _in_parallel(self, work: Callable[[int], _Result], groups: Iterable[int]) -> dict[int, _Result]:
-        """Work on each pair and single camera, in several threads, each of which takes the next one."""
+        """Run a function on each pair and single camera, in several threads that each take the next one when free."""
         remaining = iter(sorted(groups))
 
         def work_on_next() -> dict[int, _Result]:
@@ -226,26 +228,29 @@ class TrackingFrontend(ABC):
         return dict(sorted(results.items()))
 
     def _predicted(self, pair: int, then: TrackedFrame | None, motion_since: MotionPredictor) -> Float | None:
-        """Predict the motion of points in a pair's left camera since one of its frames."""
+        """Return the predicted motion (4, 4) of points in a pair's left camera since one of its frames, or None."""
         return None if then is None else self._moved(pair, motion_since(then.stamp_ns))
 
     def _moved(self, pair: int, cur_T_then: Float | None) -> Float | None:
-        """Return the motion of points in a pair's left camera for one of body, by eq. (1)."""
+        """Transfer a motion of body to a pair's left camera, by eq. (1): the motion (4, 4) of points there."""
         if cur_T_then is None:
             return None
         body_T_left = self._extrinsics.arrays.body_T_left[pair]
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
 
     def _steady_readout(self, stamp_ns: int, motion_since: MotionPredictor) -> ReadoutMotion | None:
-        """Continue the predicted motion since the images before, or return None where there is none."""
+        """Return the readout motion that continues the predicted one since the previous images, or None without it."""
         before_ns = max((frame.stamp_ns for frame in self._latest.values()), default=stamp_ns)
         cur_T_before = motion_since(before_ns) if before_ns < stamp_ns else None
         return None if cur_T_before is None else ReadoutMotion.steady(cur_T_before, 1e-9 * (stamp_ns - before_ns))
 
     def _refer_to(self, frames: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:
-        """Measure the next motions from the newest frames of some pairs, and add corners to their tracks.
+        """Make the newest frames of some pairs the references of the next motions, and add new corners to their tracks.
 
-        Images that all repeat are of an earlier instant than their stamp: nothing is measured from them.
+        If all images repeat earlier ones, they show an earlier instant than their stamp says, and become no references.
+
+        Returns:
+            Pair index -> tracks, with the new corners.
         """
         if self._all_frozen:
             return dict(frames)

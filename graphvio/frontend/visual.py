@@ -1,4 +1,4 @@
-"""The visual front-end as the odometry uses it: framesets in, relative poses of the rig with covariance out."""
+"""The visual front-end of a rig with stereo pairs: framesets in, relative poses of the rig with covariance out."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 from graphvio.timing import timed
 
-_MIN_NOISE_SHARE = 0.5  # of the modelled noise: matches of the few corners before blank walls are no better
+_MIN_NOISE_SHARE = 0.5  # of the modelled noise, at least: the few corners before blank walls are not matched better
 
 
 class _JudgedMotion(NamedTuple):
-    """The motion of a frameset, how far it can be trusted and why, and contradicting hypotheses."""
+    """The motion of a frameset, its quality with the reason, and the motion hypotheses that contradict each other."""
 
     motion: RelativeMotion | None
     quality: Quality
@@ -48,42 +48,45 @@ class VisualFrontend(TrackingFrontend):
     Args:
         rig: Stereo pairs, and single cameras beside them.
         config: Configuration of all stages.
-        image_mask: Masks of each image, or None.
+        image_mask: Function that makes a mask for each image, or None.
 
     Attributes:
         stage_ms: Processing time by stage of the newest frameset, milliseconds.
-        are_velocities_known: Whether those are by which rolling shutters of the newest frameset were compensated.
+        are_velocities_known: Whether the velocity by which the rolling shutters of the newest frameset were compensated
+            is known, and not only a guess; True without rolling shutters.
     """
 
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         super().__init__(rig, config, image_mask)
         self._baselines_m = _baselines_m(rig)
-        # Wrong focal lengths and baselines scale all motions by one factor, which no residual shows. With an IMU it is
-        # added to the covariance, so that vision does not correct the IMU by it; without one nothing shows the scale.
+        # Wrong focal lengths and baselines scale all motions by one factor, which no residual shows. With an IMU, its
+        # variance is added to the covariance, so that vision does not correct the IMU's scale; without an IMU, nothing
+        # measures the scale.
         file_error_share = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
         error_share = float(np.hypot(config.motion.shared_error_share, file_error_share))
         self._scale_sigma = 0.0 if rig.imu is None else error_share
-        self._noise_px = config.motion.pixel_sigma_px  # of the last good motion's points
-        self._is_reference_of_few = False  # whether the reference began at points too few for a motion
+        self._noise_px = config.motion.pixel_sigma_px  # by the residuals of the last good motion
+        self._is_reference_of_few = False  # whether the reference began with too few points for a motion
         self._readouts = Readouts(rig) if self._has_rolling_shutter else None
         self.are_velocities_known = True
-        self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
+        self._contradicted_ns: int | None = None  # when two pairs' motions last differed by over 5 sigma
 
     @property
     def are_lines_off(self) -> bool:
-        """Whether some pair's corners are found beside the epipolar lines of the calibration."""
+        """Whether the corners of some pair are matched on lines beside the epipolar lines of the calibration."""
         return any(tracker.are_lines_off for tracker in self._trackers)
 
     def recalibrate(
         self, rig: Rig, epipolar_margin_px: float, uncertain: Mapping[int, Float] = MappingProxyType({})
     ) -> None:
-        """Take another calibration of the same cameras from the next frameset on.
+        """Use another calibration of the same cameras from the next frameset on.
 
-        Points of the references are triangulated again, so that a motion is measured with one calibration.
+        Points of the references are triangulated again, so that every motion is measured with a single calibration.
 
         Args:
-            rig: with the calibration.
-            epipolar_margin_px: by how much it may move epipolar lines, added to what matches may be off.
+            rig: the rig, with the new calibration.
+            epipolar_margin_px: by how much its epipolar lines may be off, pixels; added to the largest epipolar error
+                of a match.
             uncertain: index of a pair or single camera -> covariance (6, 6) of its extrinsics relative to the first
                 pair, see `agree`.
         """
@@ -128,7 +131,7 @@ class VisualFrontend(TrackingFrontend):
 
     @timed("motion")
     def _estimate_motion(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> tuple[Agreement | None, str]:
-        """Estimate the motion from all pairs, eq. (1) to (4), or return None and why there is none."""
+        """Estimate the motion from all pairs, eq. (1) to (4), or return None and the reason why there is none."""
         if not seen.reference:
             return None, seen.frozen.reason if self._all_frozen or not seen.frames else "first images"
         config, observations, arrays = self._config.motion, seen.correspondences.observations, self._extrinsics.arrays
@@ -162,9 +165,10 @@ class VisualFrontend(TrackingFrontend):
         motion_since: MotionPredictor,
         contradicted_ns: int | None,
     ) -> tuple[TrackedFrameset, Agreement | None, str]:
-        """Measure a motion by rolling shutters again with the velocities that it shows, where no state knows them.
+        """Measure a motion again, with rolling shutters compensated by the velocities that it shows, if none are known.
 
-        Until then the pairs last contradicted each other at ``contradicted_ns``: with wrong velocities they may do so.
+        ``contradicted_ns`` is when the pairs last contradicted each other before this frameset. It is restored for the
+        second estimate, since wrong velocities may make the pairs contradict each other.
         """
         readouts.note(seen, agreement.hypotheses[0].refined.cur_T_ref)
         again = readouts.compensated_by_motion(seen, self._trackers, self._references, self._rig)
@@ -179,10 +183,10 @@ class VisualFrontend(TrackingFrontend):
 
     @timed("motion")
     def _fit_few_points(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> FewPoints | None:
-        """Correct the predicted motion by points that are too few for a motion, if an IMU predicts it.
+        """Correct a motion that an IMU predicts by points that are too few to measure a motion.
 
-        Depths of single cameras have no scale of their own: only pairs count. Where corners are not found in the right
-        images, the few that are may be wrong all alike.
+        Only points of stereo pairs are used, since depths of single cameras have no scale of their own. If most corners
+        are not found in the right images, there is no result: the few that are found may all be wrong in the same way.
         """
         if not seen.reference or self._rig.imu is None or seen.frozen.all_since_ns is not None:
             return None
@@ -207,7 +211,7 @@ class VisualFrontend(TrackingFrontend):
     def _judge(
         self, seen: TrackedFrameset, agreement: Agreement | None, reason: str, motion_since: MotionPredictor
     ) -> _JudgedMotion:
-        """Decide how far the motion can be trusted."""
+        """Return the motion with its quality, and with a covariance that failed checks have enlarged."""
         if agreement is None:
             return _JudgedMotion(None, Quality.FAILED, reason)
         arrays, observations = self._extrinsics.arrays, seen.correspondences.observations
@@ -236,7 +240,7 @@ class VisualFrontend(TrackingFrontend):
 
     @timed("quality")
     def _drop_outliers(self, seen: TrackedFrameset, agreement: Agreement | None) -> None:
-        """Drop the tracks that the motion does not explain; none without a motion."""
+        """Drop the tracks that are no inliers, see `inliers_of`; without a motion, drop none."""
         if agreement is None:
             return
         for j, rows in seen.correspondences.rows.items():
@@ -250,16 +254,17 @@ class VisualFrontend(TrackingFrontend):
         few: FewPoints | None,
         motion_since: MotionPredictor,
     ) -> tuple[dict[int, TrackedFrame], dict[int, RelativeMotion]]:
-        """Start a keyframe with new corners if one is due, or if no point shows the motion.
+        """Start a keyframe with new corners if `References` asks for one, or if no motion could be measured.
 
-        The keyframe that ends corrects where the pairs are to each other, if they have shown it.
+        A keyframe that began with too few points for a motion may go on without one. The pairs' own motions over a
+        keyframe that ends are used to correct the extrinsics between pairs.
 
         Returns:
-            Pair index -> tracks with new corners, and pair index -> its own motion over the keyframe; empty where the
-            keyframe goes on.
+            Pair index -> tracks with new corners, and pair index -> its own motion over the keyframe that ends; both
+            are empty if the keyframe goes on.
         """
         if agreement is None:
-            # A keyframe of a motion ends here: what its points share is not what the few that are left share.
+            # A keyframe with full motions ends here: its points' shared covariance is not that of the few left.
             goes_on = (
                 few is not None
                 and self._is_reference_of_few
@@ -269,7 +274,7 @@ class VisualFrontend(TrackingFrontend):
             return ({} if goes_on else self._refer_to(seen.frames)), {}
         self._is_reference_of_few = False
         refined, is_contradicted = agreement.hypotheses[0].refined, len(agreement.hypotheses) > 1
-        # Where pairs contradict each other, many short motions soonest show which one is right.
+        # While pairs contradict each other, many short motions show soonest which one is right.
         if not is_contradicted and not self._references.must_be_replaced(
             seen.frames, seen.correspondences, refined.inlier
         ):
@@ -283,14 +288,14 @@ class VisualFrontend(TrackingFrontend):
     # ------------------------------------------------------------------ parts of these steps
 
     def _shown_noise_px(self, agreement: Agreement) -> float:
-        """Return the noise of a pixel as the points of a motion show it, and a bit more, as in its covariance."""
+        """Return the pixel noise that the residuals of a motion show, inflated as in the motion's covariance."""
         config = self._config.motion
         rms_px = agreement.hypotheses[0].refined.rms_px() or config.pixel_sigma_px
         return max(config.sigma_inflation * rms_px, _MIN_NOISE_SHARE * config.pixel_sigma_px)
 
     def _advance_histories(self, seen: TrackedFrameset, refined: Refined, motion_since: MotionPredictor) -> None:
-        """Note the motion over the keyframe that ends, by which single cameras locate points."""
-        # A motion that single cameras alone have measured has the scale of earlier depths; the state's is better known.
+        """Store the motion over the keyframe that ends, from which depths of single cameras' points are computed."""
+        # A motion that single cameras alone have measured has the scale of earlier depths; the prediction's is better.
         are_singles = is_of_singles(self._extrinsics.arrays, seen.correspondences.observations, refined)
         predicted = motion_since(seen.reference_stamp_ns) if are_singles else None
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
@@ -298,11 +303,11 @@ class VisualFrontend(TrackingFrontend):
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
 
     def _is_in_doubt(self, now_ns: int) -> bool:
-        """Whether the pairs contradicted each other a moment ago."""
+        """Return whether the pairs contradicted each other a moment ago."""
         return self._contradicted_ns is not None and 0 <= now_ns - self._contradicted_ns < THRESHOLDS.agreement.doubt_ns
 
     def _checked_hypotheses(self, seen: TrackedFrameset, agreement: Agreement) -> list[CheckedHypothesis]:
-        """Check each motion hypothesis on its own."""
+        """Apply the quality checks to each motion hypothesis on its own."""
         stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
         return [
             checked_hypothesis(
@@ -330,7 +335,10 @@ class VisualFrontend(TrackingFrontend):
     def _with_readout_errors(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
     ) -> RelativeMotion:
-        """Add how a motion by rolling shutters depends on the velocities, which only an IMU's state has."""
+        """Add the derivatives of a motion with respect to the velocities by which rolling shutters are compensated.
+
+        Without an IMU no state has these velocities: their uncertainty is then added to the covariance instead.
+        """
         if self._readouts is None:
             return motion
         errors = self._readouts.errors(seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px)
@@ -338,7 +346,7 @@ class VisualFrontend(TrackingFrontend):
         return motion if seen.readout is not None and seen.readout.is_by_imu else motion.with_any_velocity()
 
     def _scale_covariance(self, ref_T_cur: Float) -> Float:
-        """Return the covariance (6, 6) of an error that is a share of a motion's angle and length."""
+        """Return the covariance (6, 6) of a scale error, which is a share of a motion's angle and length."""
         angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3].copy())), np.linalg.norm(ref_T_cur[:3, 3])
         return np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
 
@@ -359,7 +367,7 @@ class VisualFrontend(TrackingFrontend):
     def _with_nuisances(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
     ) -> RelativeMotion:
-        """Add how a motion depends on the velocities of readouts and on the pairs' depths, which may be wrong."""
+        """Add the derivatives of a motion by nuisance variables: readout velocities and errors of the pairs' depths."""
         return self._with_depth_errors(self._with_readout_errors(motion, seen, refined), seen, refined)
 
     def _with_depth_errors(
@@ -373,7 +381,7 @@ class VisualFrontend(TrackingFrontend):
         return replace(motion, by_depth_errors=derivatives)
 
     def _own_motions(self, seen: TrackedFrameset, agreement: Agreement) -> dict[int, RelativeMotion]:
-        """Return each pair's own motion without the corrections in force; with one pair alone, that is the rig's."""
+        """Return each pair's own motion by the rig's uncorrected extrinsics; with a single pair, the rig's motion."""
         first = agreement.hypotheses[0]
         alone = {first.pairs[0]: first.refined} if len(self._rig.groups) == 1 else {}
         return {

@@ -1,7 +1,8 @@
-"""What live runs learnt of the calibration of a rig, kept for the next run of the same devices.
+"""Calibrations that were estimated in live runs, stored for the next run with the same devices.
 
-It is a rig file in the user's cache, ``calibrations/DEVICES.DIGEST.yaml``, with the time of its writing. The digest is
-that of the rig that the run was given: what was learnt for another rig file does not hold for this one.
+A calibration is stored as a rig file in the user's cache, ``calibrations/DEVICES.DIGEST.yaml``; the time of storing is
+the file's modification time. The digest is that of the rig that the run was given: a calibration that was estimated
+with another rig file does not apply to this one.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ _NAMED_BY_RIG = ("v4l2", "ros2")
 
 
 class Remembered(NamedTuple):
-    """A calibration from memory.
+    """A stored calibration.
 
     Attributes:
-        rig: with the standard deviations that it has by now.
-        saved: when it was learnt, local time.
+        rig: the stored rig, with standard deviations widened for the time since.
+        saved: when it was stored, local time.
     """
 
     rig: Rig
@@ -45,12 +46,12 @@ class Remembered(NamedTuple):
 
 
 class CalibrationMemory:
-    """The memory for one rig.
+    """The stored calibration of one rig.
 
     Args:
         devices: name of the devices by their serial numbers, or an empty text where they have none.
-        rig: that the source was given, or the factory's.
-        folder: of all memories; None for the user's cache.
+        rig: the rig that the source was given, or the factory's calibration.
+        folder: the folder of all stored calibrations; None for the user's cache.
     """
 
     def __init__(self, devices: str, rig: Rig, folder: Path | None = None) -> None:
@@ -62,14 +63,14 @@ class CalibrationMemory:
 
     @property
     def name(self) -> str:
-        """What the memory is of, for messages."""
+        """Name of the devices or the rig that the calibration belongs to, for messages."""
         return self._devices or f"the rig {self._rig.name}"
 
     def recall(self) -> Remembered | None:
-        """Return what was learnt, or None where nothing was for this rig.
+        """Return the stored calibration, or None if there is none for this rig.
 
         Raises:
-            RigError: if what was learnt is of another rig file, or cannot be read.
+            RigError: if the stored calibration belongs to another rig file, or cannot be read.
         """
         if not self.path.exists():
             if self._of_other_rigs():
@@ -81,17 +82,17 @@ class CalibrationMemory:
         return Remembered(replace(rig, calibration_sigmas=sigmas), datetime.fromtimestamp(saved_s))
 
     def keep(self, odometry: Odometry) -> bool:
-        """Keep what a run has learnt, if it has; returns whether it is kept.
+        """Store the calibration that a run has estimated, if it has; returns whether it is stored.
 
         Raises:
-            OSError: if it cannot be written; what was kept before is then unchanged.
+            OSError: if it cannot be written; what was stored before is then unchanged.
         """
         estimate = odometry.calibration
         if estimate is None or not any(finding.is_observed for finding in odometry.calibration_findings):
             return False
         if estimate.is_file_exact and estimate.file_rig is self._rig:
             return False
-        if estimate.is_file_exact:  # what was remembered is good enough to stay in force; now it is known better
+        if estimate.is_file_exact:  # the stored calibration was kept in force; the new estimate is better
             estimate = replace(
                 estimate, difference=estimate.posterior.mean, file_factors=np.ones_like(estimate.file_factors)
             )
@@ -102,7 +103,7 @@ class CalibrationMemory:
         return True
 
     def forget(self) -> None:
-        """Remove what was learnt, for this rig file and for others.
+        """Remove the stored calibrations of the devices, for this rig file and for others.
 
         Raises:
             OSError: if it cannot be removed.
@@ -111,7 +112,7 @@ class CalibrationMemory:
             path.unlink(missing_ok=True)
 
     def _of_other_rigs(self) -> list[Path]:
-        """List what was learnt for the same devices with other rig files; without serial numbers nobody knows."""
+        """List what is stored for the same devices with other rig files; nothing if they have no serial numbers."""
         if not self._devices:
             return []
         found = self._folder.glob("*.yaml") if self._folder.is_dir() else ()
@@ -119,14 +120,14 @@ class CalibrationMemory:
 
 
 def devices_of(spec: str, source_name: str) -> str | None:
-    """Return the devices of a live source by their serial numbers, empty where they have none.
+    """Return the name of a live source's devices by their serial numbers, empty where they have none.
 
     Args:
         spec: text of the source on the command line.
-        source_name: of the source.
+        source_name: name of the opened source.
 
     Returns:
-        The devices, or None for recordings: equal input gives equal output there.
+        The name, or None for recordings, for which nothing is stored: equal input gives equal output there.
     """
     kind = spec.partition(":")[0].partition("?")[0]
     if kind in _NAMED_BY_SERIAL:
@@ -135,7 +136,7 @@ def devices_of(spec: str, source_name: str) -> str | None:
 
 
 def widened(sigmas: CalibrationSigmas, of_file: CalibrationSigmas, passed_s: float) -> CalibrationSigmas:
-    """Return standard deviations after a time: the calibration walks, at most as far as the rig file may be wrong."""
+    """Return standard deviations widened by the calibration's random walk over a time, at most to the rig file's."""
     return CalibrationSigmas(
         **{
             name: max(min(float(np.hypot(sigma, WALK * np.sqrt(passed_s) * limit)), limit), sigma)

@@ -1,4 +1,4 @@
-"""Stamps on the host's clock: of devices with clocks of their own, and of sensors that share a clock."""
+"""Corrections of sensors' stamps: maps of devices' clocks to the host's, and a shared clock that may be set back."""
 
 from __future__ import annotations
 
@@ -11,37 +11,38 @@ from graphvio.live.envelope import Envelope, Line
 from graphvio.measurements.events import EventKind, Report
 
 _MAX_OFFSET_NS = 500_000_000  # a stamp that is off by more is of a clock that was set or restarted
-_FAST_SLEW_NS = 1_000_000_000  # so long since its start the map may be corrected by _FAST_SLEW,
-_FAST_SLEW = 0.5  # seconds per second: any initial error is gone by its end,
-_SLEW = 1e-3  # and by this much from then on
+_FAST_SLEW_NS = 1_000_000_000  # time from the beginning of a map in which it is corrected by _FAST_SLEW at most
+_FAST_SLEW = 0.5  # seconds per second: corrects any initial error within that time
+_SLEW = 1e-3  # seconds per second, maximum correction after that time
 _KNOT_INTERVAL_NS = 20_000_000
-_KNOTS = 64  # more than a second of them: nothing older is mapped
-_CONFIRMATIONS = 3  # readings that agree on another clock,
-_CONFIRMED_NS = 50_000_000  # for so long, so that a queue that empties is not enough,
-_CONFIRMED_PAUSE_NS = 1_000_000_000  # and longer if their stamps continue, which a pause of the host explains
+_KNOTS = 64  # for more than a second: older stamps are not mapped
+_CONFIRMATIONS = 3  # number of readings that have to agree on another clock
+_CONFIRMED_NS = 50_000_000  # minimum time in which they arrive, so that a burst from a queue is not enough
+_CONFIRMED_PAUSE_NS = 1_000_000_000  # the same if stamps continue the previous ones, as after a pause of the host
 
-_MAX_BACK_NS = 250_000_000  # a stamp that is farther behind its sensor's is of a clock that was set back
-_MAX_AHEAD_NS = 100_000_000  # of one sensor's stamps to the others'
-_GAP_NS = round((MAX_UNBRIDGED_S + 1.0) * 1e9)  # so that the odometry begins a new epoch
+_MAX_BACK_NS = 250_000_000  # a stamp farther behind its sensor's recent ones is of a clock that was set back
+_MAX_AHEAD_NS = 100_000_000  # of one sensor's stamps relative to the others'
+_GAP_NS = round((MAX_UNBRIDGED_S + 1.0) * 1e9)  # long enough that the odometry begins a new epoch
 _RECENT = 3
 
 
 class ClockMap:
-    """The function from a device's stamps to the host's time, estimated from stamps and arrivals.
+    """Map from a device's stamps to the host's time, estimated from stamps and arrival times.
 
-    All stamps of a device, of whatever sensor, go through the same function: it is continuous, increases, and once a
-    stamp has been mapped, every stamp up to it always maps to the same time. Its errors are corrected by a rate on top
-    of the drift, 0.5 s/s at most in its first second and 1 ms/s from then on.
+    All sensors of a device share the map. It is continuous and increasing, and once a stamp has been mapped, every
+    stamp up to it always maps to the same time. Errors are corrected gradually, by a rate on top of the drift: 0.5 s/s
+    at most in the first second and 1 ms/s from then on.
 
-    The least delay of messages cannot be distinguished from an offset: mapped times are later than the truth by it.
+    The minimum delay of messages cannot be distinguished from an offset: mapped times are late by this delay.
 
-    A clock that is off by more than 0.5 s is mapped again; the drift, which is the crystal's, is kept. Three stamps
-    have to agree on that over 50 ms, and are not mapped until they do.
+    If a clock is off by more than 0.5 s, a new map is begun; the drift is kept, as it is that of the crystal. Three
+    stamps have to agree on this over 50 ms, and are not mapped until then. Stamps that may only be late, after a pause,
+    have to agree over 1 s, and are mapped as before until then.
 
     Args:
-        name: of the clock, for people.
-        report: takes ``clock_restarted``, ``clock_stepped`` where the clock went forward by less and is followed
-            slowly, and ``stamp_implausible`` where a stamp is not mapped.
+        name: name of the clock, for people.
+        report: takes events: ``clock_restarted``, ``clock_stepped`` where the clock went forward by less and is
+            followed slowly, and ``stamp_implausible`` where a stamp is not mapped.
     """
 
     def __init__(self, name: str, report: Report) -> None:
@@ -49,14 +50,14 @@ class ClockMap:
         self._report = report
         self._envelope = Envelope()
         self._knots: deque[_Knot] = deque(maxlen=_KNOTS)
-        self._origin_ns = 0  # stamp
-        self._offset_ns = 0  # host's time at the origin, less the stamp
-        self._newest = 0  # since the origin
+        self._origin_ns = 0  # stamp at which the map begins
+        self._offset_ns = 0  # host's time at the origin minus its stamp
+        self._newest = 0  # newest stamp, since the origin
         self._suspicion: _Suspicion | None = None
         self._may_have_restarted = False
 
     def expect_restart(self) -> None:
-        """Map the clock again at once if the next stamp says so, as the device was away."""
+        """Accept, as the device was away, that the clock has restarted as soon as a single stamp shows it."""
         self._may_have_restarted = True
 
     def map(self, stamp_ns: int, arrival_ns: int) -> int | None:
@@ -84,7 +85,7 @@ class ClockMap:
         return stamp_ns + self._offset_ns + round(knot.delay(at))
 
     def _start(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Map from here on as if this message was not delayed; after all that was mapped before."""
+        """Begin a new map, as if this message was not delayed, but later than all times that were mapped before."""
         start_ns = arrival_ns
         if self._knots:
             start_ns = max(arrival_ns, self._mapped(self._origin_ns + self._newest) + 1)
@@ -106,7 +107,7 @@ class ClockMap:
             self._knots.append(_Knot(newest, self._envelope.line.at(newest) - last.delay(newest), self._envelope.line))
 
     def _continues(self, stamp_ns: int, late_ns: int) -> bool:
-        """Whether a pause of the host or of the link may have made a message late."""
+        """Return whether a message may only be late, after a pause of the host or of the link."""
         return late_ns > 0 and stamp_ns - self._origin_ns > self._newest - _MAX_OFFSET_NS
 
     def _is_other_clock(self, stamp_ns: int, arrival_ns: int, late_ns: int) -> bool:
@@ -122,21 +123,21 @@ class ClockMap:
 
 @dataclass(frozen=True, slots=True)
 class _Knot:
-    """From a stamp on, the map approaches a line."""
+    """A part of the map, from a stamp on, in which the map approaches a line."""
 
     start: int  # stamp since the map's origin, ns
-    error: float  # of the map there, relative to the line, ns
+    error: float  # the line's delay minus the map's at this stamp, ns
     line: Line  # delay over stamp, both since the origin, ns
 
     def delay(self, at: int) -> float:
-        """Return what to add to a stamp, on top of the map's offset, ns."""
+        """Return the delay (ns) at a stamp since the origin, which is added to the stamp and the map's offset."""
         corrected = max(_max_correction(at) - _max_correction(self.start), 0.0)
         left = max(abs(self.error) - corrected, 0.0)
         return self.line.at(at) - (left if self.error > 0.0 else -left)
 
 
 def _max_correction(at: int) -> float:
-    """How much a map may be corrected up to a stamp since its origin, ns."""
+    """Return by how much a map may have been corrected up to a stamp since its origin, ns."""
     return _FAST_SLEW * min(at, _FAST_SLEW_NS) + _SLEW * max(at - _FAST_SLEW_NS, 0)
 
 
@@ -144,9 +145,9 @@ def _max_correction(at: int) -> float:
 class _Suspicion:
     """Consecutive readings that agree on another clock."""
 
-    offset_ns: int
-    since_ns: int
-    count: int
+    offset_ns: int  # arrival minus stamp, of the first of them
+    since_ns: int  # host time at which it arrived
+    count: int  # number of these readings
 
 
 class ClockMaps:
@@ -163,29 +164,33 @@ class ClockMaps:
         return self._maps[clock].map(stamp_ns, arrival_ns)
 
     def expect_restart(self, clock: str | None) -> None:
-        """See `ClockMap.expect_restart`; for every notice that a device was lost or is back."""
+        """See `ClockMap.expect_restart`; called for every notice that a device was lost or is back."""
         if clock in self._maps:
             self._maps[clock].expect_restart()
 
 
 class SharedClock:
-    """The clock of all sensors whose stamps are used as they are, until it is set back.
+    """The clock of all sensors whose stamps are used unchanged, as long as it is not set back.
 
     A host's clock may be set back by its administrator, and that of a bag when it is played again. From then on an
-    offset is added to stamps so that they continue four seconds after all before, and the odometry begins a new epoch.
-    Stamps that are still under way from before are late, and left out. Single wild stamps set nothing back.
+    offset is added to stamps so that they continue four seconds after all earlier ones, and the odometry begins a new
+    epoch. Stamps from before the change that arrive after it are late, and left out. Single outliers among the stamps
+    do not count as a change.
 
     Args:
-        report: takes ``clock_restarted``, and ``stamp_implausible`` where a stamp is not used.
+        report: takes events: ``clock_restarted``, and ``stamp_implausible`` where a stamp is not used.
     """
 
     def __init__(self, report: Report) -> None:
         self._report = report
-        self._offsets_ns = [0]  # the first, and one for each time the clock was set back
+        self._offsets_ns = [0]  # one for the beginning, and one for each time the clock was set back
         self._sensors: dict[str, _Sensor] = {}
 
     def map(self, sensor: str, stamp_ns: int) -> int | None:
-        """Return the stamp of a sensor, in order but for few, with the offset in force; None if it is implausible."""
+        """Return a sensor's stamp with the offset in force, or None if it is implausible.
+
+        A sensor's stamps have to be in order, except for a few.
+        """
         latest = len(self._offsets_ns) - 1
         own = self._sensors.setdefault(sensor, _Sensor(latest))
         if own.setting < latest and stamp_ns + self._offsets_ns[latest] <= self._newest_ns(latest) + _MAX_AHEAD_NS:
@@ -213,7 +218,7 @@ class SharedClock:
         own.restart(latest + 1)
 
     def _newest_ns(self, setting: int) -> int:
-        """Newest stamp of all sensors in a setting of the clock, with its offset."""
+        """Return the newest stamp of all sensors that are in a setting of the clock, with the setting's offset."""
         stamps = [each.typical_ns for each in self._sensors.values() if each.setting == setting and each.recent_ns]
         return max(stamps) + self._offsets_ns[setting]
 
@@ -222,16 +227,16 @@ class SharedClock:
 class _Sensor:
     """The state of one sensor of a shared clock."""
 
-    setting: int  # of the clock: how many times it had been set back
+    setting: int  # setting of the clock: how many times it had been set back
     recent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))  # its newest stamps
-    behind: int = 0  # how many in a row were too early
+    behind: int = 0  # number of stamps in a row that were too early
 
     @property
     def typical_ns(self) -> int:
-        """Median of the recent stamps: a wild one does not matter."""
+        """Median of the recent stamps, which a single outlier does not affect."""
         return sorted(self.recent_ns)[len(self.recent_ns) // 2]
 
     def restart(self, setting: int) -> None:
-        """Forget the stamps before; those to come are of another setting."""
+        """Forget the previous stamps; those to come belong to another setting of the clock."""
         self.setting, self.behind = setting, 0
         self.recent_ns.clear()

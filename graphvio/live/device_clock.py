@@ -1,4 +1,4 @@
-"""Stamps of devices by counters that wrap, and of the kernel by the host's other clocks."""
+"""Conversion of stamps: from devices' counters, which wrap, and from the kernel's clocks to the host's time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _MONOTONIC_TO_HOST_NS = host_ns() - time.monotonic_ns()
 class MicrosecondCounter:
     """Stamps in nanoseconds from a counter of 32 bits, which wraps every 71.6 minutes.
 
-    Sensors of one device share an instance, so that their stamps agree; any thread may call. Wider counters work, too,
-    as long as nothing pauses for half an hour.
+    Sensors of one device share an instance, so that their stamps agree; any thread may call it. Counters of more bits
+    work, too, as long as no pause lasts half an hour.
     """
 
     _PERIOD_US = 1 << 32
@@ -24,7 +24,7 @@ class MicrosecondCounter:
         self._newest_us: float | None = None
 
     def stamp_ns(self, counter_us: float) -> int:
-        """Return the stamp of a counter's value that is nearest to the newest stamp."""
+        """Return the stamp of a counter's value, unwrapped so that it is nearest to the newest stamp."""
         with self._lock:
             if self._newest_us is None:
                 self._newest_us = counter_us
@@ -45,7 +45,7 @@ def host_ns_of_realtime(realtime_ns: int) -> int:
 
 
 def realtime_to_host_ns() -> int:
-    """Return what to add to ``CLOCK_REALTIME`` now; the tightest of three readings, as threads are interrupted."""
+    """Return the host's time minus ``CLOCK_REALTIME`` now; the best of three readings, as threads are interrupted."""
     readings = []
     for _ in range(3):
         before_ns, realtime_ns, after_ns = host_ns(), time.time_ns(), host_ns()

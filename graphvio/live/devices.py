@@ -1,4 +1,4 @@
-"""Devices as one live source: each has a thread that reads it, and reconnects it when it was lost."""
+"""Several devices as one live source: each has a thread that reads it, and reconnects it after a loss."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from graphvio.rig import Rig
 HandOver = Callable[[Reading], None]
 
 _MIN_RETRY_S, _MAX_RETRY_S = 0.5, 4.0
-_MAX_AGE_NS = 2_000_000_000  # of readings that wait: some tens of megabytes of images
+_MAX_AGE_NS = 2_000_000_000  # age of waiting readings from which they are dropped: some tens of megabytes of images
 _JOIN_S = 2.0
 _log = logging.getLogger(__name__)
 
 
 class DeviceLostError(Exception):
-    """A device does not deliver any more; the message says what was seen."""
+    """Raised when a device does not deliver any more; the message describes the symptom."""
 
 
 class Counts:
@@ -47,12 +47,12 @@ class Counts:
 
 
 class Mailbox:
-    """Queue of readings of several devices for one reader; those that wait too long are dropped, except notices."""
+    """Queue of several devices' readings for one consumer; readings that wait too long are dropped, except notices."""
 
     def __init__(self, max_age_ns: int = _MAX_AGE_NS) -> None:
         self._max_age_ns = max_age_ns
         self._changed = threading.Condition()
-        self._kept: deque[Notice] = deque()  # older than all that wait
+        self._kept: deque[Notice] = deque()  # notices that are older than all waiting readings
         self._waiting: deque[tuple[str, Reading]] = deque()
         self._is_closed = False
         self._dropped = Counts()
@@ -93,10 +93,10 @@ class Mailbox:
 
 
 class Device(Protocol):
-    """Interface of a device, whose methods are called by one thread at a time, but for `detail`.
+    """Interface of a device; its methods are called by one thread at a time, except for `detail`.
 
     Attributes:
-        counts: losses by kind.
+        counts: number of losses by kind.
     """
 
     counts: Counts
@@ -116,11 +116,11 @@ class Device(Protocol):
             hand_over: takes readings; the driver's threads may call it from here on.
 
         Raises:
-            SourceError: if the device is missing or refuses.
+            SourceError: if the device is missing or cannot be started.
         """
 
     def run(self, hand_over: HandOver, stopping: threading.Event) -> None:
-        """Hand over readings, or monitor the driver's threads that do, until the end.
+        """Hand over readings, or monitor the driver's threads that do so, until the device is stopped or lost.
 
         Args:
             hand_over: takes readings.
@@ -131,7 +131,7 @@ class Device(Protocol):
         """
 
     def stop(self) -> None:
-        """Release the device, also where it is half started or gone."""
+        """Release the device, even if it is only partly started or already gone."""
 
     def detail(self) -> str:
         """Return one line for people: model, firmware, what is wrong."""
@@ -141,10 +141,10 @@ class DeviceSource:
     """Devices as a `LiveSource`; see there.
 
     Args:
-        name: for people.
-        devices: to be read.
+        name: name of the source, for people.
+        devices: the devices to read.
         rig: returns the rig when all devices are started; may raise RigError.
-        retry_s: the first pause before a lost device is looked for, and the longest.
+        retry_s: first and longest pause before a lost device is looked for again.
     """
 
     is_realtime = True
@@ -235,7 +235,7 @@ class DeviceSource:
             device.run(self._hand_over(device), self._stopping)
         except DeviceLostError as error:
             return str(error)
-        except Exception as error:  # of any kind: the run goes on
+        except Exception as error:  # drivers raise any kind of error: the run goes on
             _log.warning("%s: the driver failed", device.name, exc_info=True)
             return f"{type(error).__name__}: {error}"
         return "it ended on its own"

@@ -1,9 +1,9 @@
-"""A clock's offset and drift from the messages that were delayed least.
+"""Estimation of a clock's offset and drift from the messages that were delayed least.
 
-Delays are never less than the least one, and at random much more. So the line lies below all points, and as close to
-them as possible: it is the edge of their lower convex hull at the mean of their times. Zhang, Liu, Xia: Clock
-synchronization algorithms for network measurements, INFOCOM 2002; Moon, Skelly, Towsley: Estimation and removal of
-clock skew from network delay measurements, INFOCOM 1999.
+Delays have a minimum, and are often much longer at random. So the line of the minimum delay over time lies below all
+points and as close to them as possible: it is the edge of their lower convex hull at the mean of their times. Zhang,
+Liu, Xia: Clock synchronization algorithms for network measurements, INFOCOM 2002; Moon, Skelly, Towsley: Estimation and
+removal of clock skew from network delay measurements, INFOCOM 1999.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 _WINDOW_NS = 1_000_000_000
-_WINDOWS = 60  # one point of each: a crystal's rate wanders little in a minute
-_MIN_WINDOWS = 3  # for a drift
+_WINDOWS = 60  # number of windows, with one point each: a crystal's rate changes little in a minute
+_MIN_WINDOWS = 3  # number of windows from which the drift is estimated
 _MAX_DRIFT = 1e-3  # ten times that of any crystal
-_STEP_NS = 5_000_000  # below the line by more, and repeatedly: the clock was set forward
+_STEP_NS = 5_000_000  # if points are farther below the line, repeatedly, the clock was set forward
 _STEP_READINGS = 3
 
 _Point = tuple[int, int]
@@ -35,13 +35,14 @@ class Line:
 
 
 class Envelope:
-    """The least delay over time, followed as points come.
+    """Estimates the line of the least delay over time as points are added.
 
-    Its offset is known from the first point on; its drift, ns of delay per ns of time, after three windows of a second.
-    Where the least delay grows, as on a busy machine, nothing changes for half a minute; if it stays, it is followed.
+    The line has an offset from the first point on, and a drift, ns of delay per ns of time, after three windows of a
+    second. If the least delay grows, as on a busy machine, the line does not change for half a minute; if it stays so,
+    the line follows.
 
     Args:
-        drift: to be used until there is an estimate.
+        drift: the drift to use until there is an estimate.
 
     Attributes:
         line: the newest estimate.
@@ -50,7 +51,7 @@ class Envelope:
     def __init__(self, drift: float = 0.0) -> None:
         self.line = Line(0.0, drift)
         self._windows: deque[_Point] = deque(maxlen=_WINDOWS)
-        self._least: _Point | None = None  # of the window that is open
+        self._least: _Point | None = None  # lowest point of the open window
         self._opened_ns = 0
         self._below: list[_Point] = []
 
@@ -58,11 +59,11 @@ class Envelope:
         """Add a point.
 
         Args:
-            time_ns: of the clock.
-            delay_ns: of the message, up to a constant.
+            time_ns: time of the clock.
+            delay_ns: delay of the message, up to a constant.
 
         Returns:
-            Whether the clock was set forward: delays are now so much less that all points before are forgotten.
+            Whether the clock was set forward: delays are now so much smaller that all previous points are forgotten.
         """
         point = (time_ns, delay_ns)
         if self._windows and delay_ns < self.line.at(time_ns) - _STEP_NS:
@@ -83,7 +84,7 @@ class Envelope:
         return False
 
     def _add_below(self, point: _Point) -> bool:
-        """Add a point that no delay explains; one alone may be a damaged stamp, and is not used."""
+        """Add a point far below the line; a single one may be due to a damaged stamp, and is not used."""
         self._below.append(point)
         if len(self._below) < _STEP_READINGS:
             return False
@@ -100,11 +101,11 @@ class Envelope:
         self.line = Line(self._height(point), self.line.drift)
 
     def _height(self, point: _Point) -> float:
-        """Delay at time zero on the parallel to the line through a point."""
+        """Return the delay at time zero on the line through a point that has the present drift."""
         return point[1] - self.line.drift * point[0]
 
     def _fit(self) -> None:
-        points = sorted(self._windows)  # late messages have come between
+        points = sorted(self._windows)  # late messages may be out of order
         drift = self.line.drift
         if len(points) >= _MIN_WINDOWS:
             drift = min(max(_slope_of_middle(_lower_hull(points), points), -_MAX_DRIFT), _MAX_DRIFT)
@@ -112,7 +113,7 @@ class Envelope:
 
 
 def _lower_hull(points: list[_Point]) -> list[_Point]:
-    """Vertices of the lower convex hull, by time; in integers, so that nothing is rounded."""
+    """Return the vertices of the lower convex hull, by time; computed in integers, so that nothing is rounded."""
     hull: list[_Point] = []
     for point in points:
         if hull and hull[-1][0] == point[0]:
@@ -127,7 +128,7 @@ def _lower_hull(points: list[_Point]) -> list[_Point]:
 
 
 def _slope_of_middle(hull: list[_Point], points: list[_Point]) -> float:
-    """Slope of the edge under the mean time of all points: no other line below them is as close to them."""
+    """Return the slope of the edge at the mean time of all points: no other line below them is as close to them."""
     total = sum(time for time, _ in points)
     for (t0, d0), (t1, d1) in pairwise(hull):
         if t1 * len(points) >= total:

@@ -1,7 +1,7 @@
-"""The odometry as a stage: its queues, which framesets are skipped, and when it no longer waits for the IMU.
+"""The odometry stage of a live run: its queues, the skipping of framesets, and the limit on waiting for the IMU.
 
-Front-end and back-end are one stage: the front-end looks for points where the back-end's newest state predicts them,
-so that neither has anything to do while the other works. The front-end itself has a thread for each pair.
+Front-end and back-end are one stage: the front-end searches for points where the back-end's newest state predicts
+them, so that the two cannot work at the same time. The front-end itself has a thread for each pair.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from graphvio.odometry import Odometry
 from graphvio.queues import BoundedQueue, Limit, WhenFull
 
 FRAMESETS = "framesets"
-"""The lane of framesets in an inbox; samples are in the default one."""
+"""The lane of framesets in an inbox; IMU samples are in the default lane."""
 
 Inbox = BoundedQueue[tuple[Measurement, int]]
 """Measurements that wait for the odometry, with the host time of their arrival."""
 
 _WAITING_FRAMESETS = 8
-_WAITING_SAMPLES = 50_000  # minutes: where so many wait, the odometry is dead
-_WAITING_RESULTS = 64  # for the outputs
-_READ_AHEAD = 2  # framesets and results, where the source waits: more would only take memory
-_KEPT_FRAMESETS = 64  # until they are estimated
+_WAITING_SAMPLES = 50_000  # some minutes: if so many wait, the odometry is dead
+_WAITING_RESULTS = 64  # estimates that wait for the outputs
+_READ_AHEAD = 2  # framesets and results that wait, if the source waits for its reader: more would only take memory
+_KEPT_FRAMESETS = 64  # framesets that are kept until they are estimated
 _ROUND_S = 0.05
-_START_NS = 500_000_000  # framesets of this time after the first pose may still be late
+_START_NS = 500_000_000  # framesets that arrive within this time after the first pose may still be late
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _UnderWay:
-    """A frameset in the odometry: its arrival, and how long it had waited when it was taken."""
+    """A frameset in the odometry: host time of its arrival, and how long it waited for the odometry."""
 
     frameset: FrameSet
     arrival_ns: int
@@ -48,9 +48,9 @@ def make_inbox(max_framesets: int, is_realtime: bool) -> Inbox:
     """Make the queue in front of the odometry.
 
     Args:
-        max_framesets: that may wait.
-        is_realtime: whether the oldest frameset is dropped where there is no room, and a sample where the odometry is
-            dead; else the threads that bring them wait.
+        max_framesets: maximum number of framesets that may wait.
+        is_realtime: whether the oldest frameset is dropped when there is no room, and samples when the odometry is
+            dead; otherwise the threads that put them wait.
     """
     if is_realtime:
         framesets = Limit(max_framesets, WhenFull.DROP_OLDEST)
@@ -59,20 +59,21 @@ def make_inbox(max_framesets: int, is_realtime: bool) -> Inbox:
 
 
 class Estimation:
-    """The stage ``odometry``.
+    """The stage ``odometry``: processes the measurements of an inbox, and delivers estimates.
 
     Args:
-        odometry: that estimates.
-        config: the limit of the latency.
-        is_realtime: whether the limit holds and measurements without room are dropped; else all wait for the odometry.
-        meter: counts estimates, what is given up, and latencies.
+        odometry: the odometry.
+        config: the configuration, with the limit of the latency.
+        is_realtime: whether the limit applies and measurements without room are dropped; otherwise all wait for the
+            odometry.
+        meter: counts estimates, skipped framesets and latencies.
         publish: takes each estimate, in this thread.
         report_events: passes on the odometry's events.
 
     Attributes:
-        inbox: of the odometry.
+        inbox: measurements that wait for the odometry.
         results: estimates that wait for the outputs, with their images if they are still kept.
-        load: decides what is given up.
+        load: decides on the number of corners and on the framesets to skip.
         latest: newest estimate, or None.
     """
 
@@ -99,7 +100,7 @@ class Estimation:
         self._publish = publish
         self._report_events = report_events
         self._corner_share = 1.0
-        self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()  # by stamp
+        self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()  # stamp -> frameset
         self._first_pose_ns: int | None = None  # host time at which it was estimated
 
     def estimate(self, stage: Stage) -> None:
@@ -136,7 +137,7 @@ class Estimation:
         self._report_events()
 
     def _patience_s(self) -> float:
-        """How long to wait for measurements: the frameset that the odometry holds for the IMU must not be late."""
+        """Return how long to wait for measurements before a frameset that is held for IMU samples would be late."""
         held_ns = self._odometry.held_ns
         under_way = None if held_ns is None else self._under_way.get(held_ns)
         if under_way is None or not self._is_limited(under_way.arrival_ns):
@@ -145,7 +146,7 @@ class Estimation:
         return min(max(1e-3 * (self.load.patience_ms - waited_ms), 0.0), _ROUND_S)
 
     def _process_held(self, stage: Stage) -> None:
-        """Estimate the oldest frameset, which cannot wait for samples that have not come."""
+        """Estimate the oldest held frameset without the IMU samples that have not come, as it can wait no longer."""
         begin_ns = host_ns()
         estimate = self._odometry.process_held()
         if estimate is not None:
@@ -153,7 +154,7 @@ class Estimation:
             self._conclude(stage, estimate, begin_ns)
 
     def _conclude(self, stage: Stage, estimate: Estimate, begin_ns: int) -> None:
-        """Adapt the load to an estimate on which work began at a host time, and deliver it."""
+        """Adapt the load to the time that an estimate took, given the host time at its beginning, and deliver it."""
         self._report_events()
         under_way = self._under_way.get(estimate.stamp_ns)
         if under_way is not None and self._is_limited(under_way.arrival_ns):
@@ -165,7 +166,7 @@ class Estimation:
 
     def _deliver(self, stage: Stage, estimate: Estimate) -> None:
         under_way, now_ns = self._under_way.pop(estimate.stamp_ns, None), host_ns()
-        self._odometry.take_smoothed()  # else they would accumulate
+        self._odometry.take_smoothed()  # otherwise they would accumulate
         self.latest = estimate
         self._meter.add_arrival("estimates", now_ns)
         self._meter.count(f"status_{estimate.status}")
@@ -180,12 +181,12 @@ class Estimation:
             self._meter.count("results_not_put_out")
 
     def _is_after_start(self, arrival_ns: int) -> bool:
-        """Whether a frameset came after the first pose.
+        """Return whether a frameset arrived long enough after the first pose.
 
-        Framesets before it are held until the IMU has shown the initial attitude, and then processed all at once.
+        Framesets before it are held until the IMU has given the initial attitude, and then processed all at once.
         """
         return self._first_pose_ns is not None and arrival_ns > self._first_pose_ns + _START_NS
 
     def _is_limited(self, arrival_ns: int) -> bool:
-        """Whether the limit of the latency holds for a frameset."""
+        """Return whether the limit of the latency applies to a frameset."""
         return self._is_realtime and self._is_after_start(arrival_ns)

@@ -1,4 +1,4 @@
-"""The figures of a live run by name, which the terminal, the metrics and the services show."""
+"""Figures of a live run by name (counts, rates, latencies), which terminal, metrics and services show."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from graphvio.measurements.readings import DeviceHealth
 
 _STATM = Path("/proc/self/statm")
 _PAGE_BYTES = 4096
-_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]+")  # of metrics
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]+")  # characters that names of metrics do not have
 _RECENT = 1200  # latencies: a minute at 20 Hz
 _RATE_S = 2.0
 _BIN_MS = 0.5
 _BINS = 4000
 _STALE_NS = 2_000_000_000
 STALE = "stale"
-"""The status where the newest estimate is older than two seconds."""
+"""The status if the newest estimate is older than two seconds."""
 
 Figures = dict[str, float | int | str | None]
 
@@ -44,7 +44,7 @@ class Meter:
             self._counts[kind] += by
 
     def add_arrival(self, kind: str, host_ns: int) -> None:
-        """Count an item of a kind that has a rate, and its arrival."""
+        """Count an item of a kind whose rate is measured, with the host time of its arrival."""
         with self._lock:
             self._counts[kind] += 1
             stamps = self._arrivals_ns.setdefault(kind, deque())
@@ -66,7 +66,7 @@ class Meter:
 
     def add_latency(self, latency_ms: float) -> None:
         """Add the time from a frameset's arrival to its estimate."""
-        latency_ms = max(latency_ms, 0.0)  # the arrival is what the source says
+        latency_ms = max(latency_ms, 0.0)  # the arrival is the time that the source gives
         with self._lock:
             self._latencies_ms.append(latency_ms)
             self._histogram[min(int(latency_ms / _BIN_MS), _BINS)] += 1
@@ -94,7 +94,7 @@ class Meter:
 
 
 def run_figures(meter: Meter, latest: Estimate | None, now_ns: int) -> Figures:
-    """Return the figures of the counts and of the newest estimate."""
+    """Return the figures of a run from its counts and its newest estimate."""
     counts = meter.counts
     kinds = ("images", "imu_samples", "framesets", "estimates", "skipped_late")
     found: Figures = {
@@ -132,7 +132,7 @@ def _estimate_figures(estimate: Estimate) -> Figures:
 
 
 def device_figures(devices: Sequence[DeviceHealth]) -> Figures:
-    """Return whether each device is connected, 1 or 0, and the losses in its driver."""
+    """Return for each device whether it is connected, 1 or 0, and the losses in its driver by kind."""
     found: Figures = {}
     for device in devices:
         name = "device_" + _NOT_IN_NAMES.sub("_", device.name)
@@ -142,7 +142,7 @@ def device_figures(devices: Sequence[DeviceHealth]) -> Figures:
 
 
 def _memory_mb() -> float | None:
-    """Resident memory of the process, or None where the system does not report it."""
+    """Return the resident memory of the process, or None where the system does not report it."""
     try:
         return int(_STATM.read_text().split()[1]) * _PAGE_BYTES / 1e6
     except OSError:

@@ -1,4 +1,4 @@
-"""Health over HTTP: Prometheus metrics at ``/metrics``, and whether all stages run at ``/healthz``."""
+"""HTTP server for the health of a live run: Prometheus metrics at ``/metrics``, state of the stages at ``/healthz``."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _TOTAL_PREFIXES = (
 
 
 class HealthServer:
-    """HTTP server with threads of its own.
+    """HTTP server for metrics and health, which runs in threads of its own.
 
     Args:
-        status: returns the figures by name; ``health`` is ``ok`` where all stages run.
+        status: returns the figures by name; ``health`` is ``ok`` if all stages run.
         host: address to listen on; the default cannot be reached from other machines.
-        port: to listen on; 0 takes a free one.
+        port: port to listen on; 0 takes a free one.
 
     Attributes:
         address: ``HOST:PORT`` that it listens on.
@@ -85,7 +85,7 @@ def _reply(start_response: Callable[..., Any], status: HTTPStatus, content: Mapp
 
 
 class _Collector:
-    """Figures as metrics; of the texts, only the status."""
+    """Collector of the figures as Prometheus metrics; of the texts, only the status is included."""
 
     def __init__(self, status: Callable[[], Figures]) -> None:
         self._status = status
@@ -115,7 +115,7 @@ class _ThreadingServer(ThreadingMixIn, WSGIServer):
 
 
 class _QuietHandler(WSGIRequestHandler):
-    """Handler that writes no log and waits for a request for some seconds only."""
+    """Handler that writes no log and waits for a request for at most ten seconds."""
 
     timeout = 10.0
 

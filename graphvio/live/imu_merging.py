@@ -1,4 +1,4 @@
-"""Gyro and accelerometer with rates of their own, as samples of one IMU."""
+"""Merging of a gyro and an accelerometer that have different rates into samples of one IMU."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ _ACCELS_KEPT = 32
 
 
 class AccelOntoGyro:
-    """Acceleration interpolated linearly between its two neighbours, at the gyro's stamps.
+    """Interpolates the acceleration linearly at the gyro's stamps.
 
-    A rate thus waits for the acceleration after it: 4 to 16 ms with accelerometers of 250 to 63 Hz. Both may come from
-    threads of their own. Rates without accelerations on both sides, 100 ms apart at most, are dropped and counted.
+    A gyro reading thus waits for the next acceleration: 4 to 16 ms with accelerometers of 250 to 63 Hz. The two sensors
+    may call from different threads. Gyro readings without accelerations on both sides, 100 ms apart at most, are
+    dropped and counted.
 
     Args:
         hand_over: takes the samples.
-        counts: takes ``imu_unpaired`` and ``imu_out_of_order``.
+        counts: counts losses as ``imu_unpaired`` and ``imu_out_of_order``.
     """
 
     def __init__(self, hand_over: Callable[[ImuReading], None], counts: Counts) -> None:
@@ -38,7 +39,7 @@ class AccelOntoGyro:
         self._accels: deque[tuple[int, Float]] = deque(maxlen=_ACCELS_KEPT)
 
     def add_gyro(self, reading: ImuReading) -> None:
-        """Add a rate, whose ``linear_acceleration`` is not read; a stamp that was there already is ignored."""
+        """Add a gyro reading, whose ``linear_acceleration`` is not read; a repeated stamp is ignored."""
         with self._lock:
             if self._newest_gyro_ns is not None and reading.stamp_ns <= self._newest_gyro_ns:
                 self._counts.add("imu_out_of_order", reading.stamp_ns < self._newest_gyro_ns)
@@ -51,7 +52,7 @@ class AccelOntoGyro:
             self._hand_over_ready()
 
     def add_accel(self, stamp_ns: int, acceleration: Float) -> None:
-        """Add an acceleration (3,), frame body; a stamp that was there already is ignored."""
+        """Add an acceleration (3,) in body, m/s^2; a repeated stamp is ignored."""
         with self._lock:
             if self._accels and stamp_ns <= self._accels[-1][0]:
                 self._counts.add("imu_out_of_order", stamp_ns < self._accels[-1][0])

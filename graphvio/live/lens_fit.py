@@ -1,8 +1,8 @@
 """Approximation of OpenCV's rational lens models by those of graphvio, and correction of images for the difference.
 
-Factory calibrations of 8 or 14 coefficients are rational models, which no model of 5 coefficients matches: with those
-of a real camera the nearest is off by 0.1 px in most of the image and by more than half a pixel in its corners. So
-images are resampled by that difference.
+Factory calibrations of 8 or 14 coefficients are rational models, which no model of 5 coefficients matches: for a real
+camera, the nearest one is off by 0.1 px in most of the image and by more than half a pixel in its corners. So images
+are resampled to remove that difference.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _MARGIN_PX = 1.0
 class FittedLens:
     """A lens with one of graphvio's models."""
 
-    model: str  # its name
+    model: str  # name of the model
     intrinsics: Float  # (4,), pixels
     distortion: Float  # (5,)
     error_px: float = 0.0  # maximum difference between the models, by which images are resampled
-    maps: tuple[AnyArray, AnyArray] | None = None  # for `corrected`, or None where the model is exact
+    maps: tuple[AnyArray, AnyArray] | None = None  # of `cv2.remap`, or None where the model is exact
 
     def corrected(self, image: Image) -> Image:
         """Return the image (height, width) that this lens would have made."""
@@ -52,10 +52,10 @@ def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int
         intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
         coefficients: ``[k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty]`` or fewer.
         size_px: (width, height) of the image.
-        where: for messages.
+        where: name of the camera, for messages.
 
     Raises:
-        RigError: if neither is near enough.
+        RigError: if neither model is near enough.
     """
     coefficients = np.asarray(coefficients, dtype=np.float64)
     if not coefficients[5:].any():
@@ -76,7 +76,7 @@ def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int
 
 
 def _sample_points(matrix: Float, coefficients: Float, size_px: tuple[int, int]) -> tuple[Float, Float]:
-    """Points (N, 3) in the camera's frame whose pixels (N, 2) are spread over the image, from border to border."""
+    """Return points (N, 3) in the camera's frame whose pixels (N, 2) cover the image from border to border."""
     pixels = _grid(np.linspace(0, size_px[0] - 1, _GRID[0]), np.linspace(0, size_px[1] - 1, _GRID[1]))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, 1e-12)
     rays = cv2.undistortPoints(pixels[:, None], matrix, coefficients, criteria=criteria).reshape(-1, 2)
@@ -103,13 +103,13 @@ def _fit(model: str, intrinsics: Float, points: Float, pixels: Float) -> FittedL
 
 
 def _maps(lens: FittedLens, matrix: Float, coefficients: Float, size_px: tuple[int, int]) -> tuple[AnyArray, AnyArray]:
-    """Where each pixel of the fitted lens is in the camera's own image, as `cv2.remap` takes it fastest."""
+    """Return where each pixel of the fitted lens is in the camera's own image, in `cv2.remap`'s fastest format."""
     pixels = _grid(np.arange(size_px[0], dtype=np.float64), np.arange(size_px[1], dtype=np.float64))
     rays, valid = unproject_pixels(MODEL_NAMES[lens.model], lens.intrinsics, lens.distortion, pixels)
     own = _projected(np.column_stack([rays, np.ones(len(rays))]), matrix, coefficients)
     # Outside its field of view, the lens model folds back into the image.
     visible = valid & (np.linalg.norm(own - pixels, axis=1) <= lens.error_px + _MARGIN_PX)
-    # Pixels of the border come from outside by a fraction of one; black there would be an edge that never moves.
+    # Border pixels map up to a fraction of a pixel outside of the image; black there would be an edge that never moves.
     own = np.clip(own, 0.0, np.array(size_px) - 1.0)
     own[~visible] = _OUTSIDE
     x, y = own.astype(np.float32).reshape(size_px[1], size_px[0], 2).transpose(2, 0, 1)

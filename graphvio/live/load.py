@@ -1,29 +1,31 @@
-"""What is given up, and in which order, when the work takes longer than there is time for.
+"""Control of the load when the odometry is slower than real time: what is given up, and in which order.
 
-First corners: fewer are tracked. Then framesets: old ones are skipped where a newer one waits. Never IMU samples.
+First fewer corners are tracked. Then old framesets are skipped if a newer one waits. IMU samples are never given up.
 """
 
 from __future__ import annotations
 
 _SHARES = (1.0, 0.7, 0.5, 0.35)
-_LATE = 0.5  # of the latency's limit
-_BUSY, _IDLE = 0.85, 0.7  # shares of the time between framesets that work takes, or would take with more corners
-_IDLE_NS = 2_000_000_000  # before more corners are tracked again
-_MIN_FRAMESETS = 5  # between changes, so that the effect of the last one shows
-_DEVIATIONS = 2.5  # mean absolute ones: two standard deviations
-_NEWEST_SHARE = 0.1  # in running means
+_LATE = 0.5  # share of the latency's limit from which framesets count as late
+# shares of the time between framesets: if work takes more than _BUSY, fewer corners are tracked; if with more corners
+# it would still take less than _IDLE, more are
+_BUSY, _IDLE = 0.85, 0.7
+_IDLE_NS = 2_000_000_000  # idle time before more corners are tracked again
+_MIN_FRAMESETS = 5  # between changes, so that the effect of the last change shows
+_DEVIATIONS = 2.5  # in mean absolute deviations, equal to two standard deviations
+_NEWEST_SHARE = 0.1  # weight of the newest value in running means
 
 
 class LoadControl:
-    """Decides how many corners are tracked and which framesets are skipped, from its inputs alone."""
+    """Decides how many corners are tracked and which framesets are skipped, only from the times that it is given."""
 
     def __init__(self, max_latency_ms: float) -> None:
         self._limit_ms = max_latency_ms
         self._level = 0
         self._waited_ms = 0.0  # running mean, as the three below
-        self._deviation_ms = 0.0  # of the work from its mean
+        self._deviation_ms = 0.0  # mean absolute deviation of the work from its mean
         self._work_ms: float | None = None
-        self._interval_ms: float | None = None  # between stamps
+        self._interval_ms: float | None = None  # interval between stamps
         self._last_ns: int | None = None
         self._since_change = 0
         self._idle_since_ns: int | None = None
@@ -35,17 +37,18 @@ class LoadControl:
 
     @property
     def patience_ms(self) -> float:
-        """How long after its arrival the work on a frameset can begin, to end in time."""
+        """Longest time after a frameset's arrival at which the work on it can begin and still end in time."""
         return max(self._limit_ms - self._likely_ms, 0.0)
 
     def must_skip(self, waited_ms: float, is_newest: bool) -> bool:
-        """Decide whether a frameset is skipped: it would be late, and a newer one waits.
+        """Decide whether a frameset is skipped, because it would be late and a newer one waits.
 
-        As long as fewer corners would help they are lowered instead, unless it is late already.
+        As long as the number of corners can be lowered, that is done instead, and only a frameset that is late already
+        is skipped.
 
         Args:
-            waited_ms: since its arrival.
-            is_newest: whether no newer one waits.
+            waited_ms: time since the frameset's arrival.
+            is_newest: whether no newer frameset waits.
         """
         if is_newest or waited_ms + self._likely_ms <= self._limit_ms:
             return False
@@ -58,9 +61,9 @@ class LoadControl:
         """Add the times of a frameset that was processed, and adapt the share of corners.
 
         Args:
-            stamp_ns: of the frameset.
-            waited_ms: from its arrival until the work began.
-            work_ms: that it took.
+            stamp_ns: stamp of the frameset.
+            waited_ms: time from its arrival until the work began.
+            work_ms: time that the work took.
         """
         if self._last_ns is not None:
             self._interval_ms = _mean(self._interval_ms, 1e-6 * (stamp_ns - self._last_ns))
@@ -85,7 +88,7 @@ class LoadControl:
 
     @property
     def _likely_ms(self) -> float:
-        """What the work on a frameset will hardly exceed."""
+        """Time that the work on a frameset will hardly exceed."""
         return (self._work_ms or 0.0) + _DEVIATIONS * self._deviation_ms
 
     def _change(self, by: int) -> None:

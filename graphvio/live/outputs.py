@@ -18,10 +18,10 @@ from graphvio.viewer import Viewer
 
 
 class Output:
-    """Base of consumers; this one ignores all. None may block the threads that hand measurements over."""
+    """Base class of consumers, which ignores everything. No consumer may block the threads that call its methods."""
 
     def add_measurement(self, measurement: Measurement) -> None:
-        """Add a sample or frameset as it comes; called from several threads."""
+        """Add an IMU sample or a frameset as it comes; called from several threads."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """Add an estimate, and its images if they are still kept."""
@@ -35,11 +35,11 @@ class Output:
 
 
 class ViewOutput(Output):
-    """Shows a live run; images are left out where the viewer has no time for them.
+    """Shows a live run in a viewer; images are left out if the viewer has no time for them.
 
     Args:
-        viewer: shows it.
-        calibration: returns what is known of the calibration, or None where it is not estimated.
+        viewer: the viewer.
+        calibration: returns the present estimate of the calibration, or None where it is not estimated.
     """
 
     def __init__(self, viewer: Viewer, calibration: Callable[[], CalibrationEstimate | None] = lambda: None) -> None:
@@ -65,7 +65,7 @@ class ViewOutput(Output):
 
 
 class PathOutput(Output):
-    """Keeps the poses in odom, and in the map as it was when they were estimated.
+    """Keeps the poses in odom, and in map with the correction in force when they were estimated.
 
     Args:
         map_T_odom: returns the correction in force, (4, 4), or None before the first.

@@ -1,4 +1,4 @@
-"""From images of cameras to framesets: which belong together, and how long others are waited for."""
+"""Assembly of framesets from cameras' images: which belong together, and how long missing ones are waited for."""
 
 from __future__ import annotations
 
@@ -14,36 +14,37 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry.synchroniser import StampJumpFilter
 from graphvio.rig import Camera, Rig
 
-_SILENT_NS = 1_000_000_000  # a pair one of whose cameras has not delivered for so long is not waited for
-_MAX_WAITING = 32  # images of a camera, or matched ones of a pair: what a wait may hold at any sensible rate
-_REMEMBERED = 32  # stamps of a camera, to know an image that comes twice
+_SILENT_NS = 1_000_000_000  # a pair is not waited for if one of its cameras has not delivered for this time
+_MAX_WAITING = 32  # images of a camera, or matched ones of a pair: enough for a wait at any sensible rate
+_REMEMBERED = 32  # stamps of a camera, to recognise an image that comes twice
 
 _by_stamp = attrgetter("stamp_ns")
 
 
 class FramesetAssembler:
-    """Assembles framesets that increase in time, by the rules by which `graphvio.sources.matching` joins recordings.
+    """Assembles framesets with increasing stamps, by the same rules as `graphvio.sources.matching` for recordings.
 
-    The left image's stamp is its pair's, and that of the first pair is the frameset's; a camera without a partner
-    counts as a pair that has no right image. A mean would depend on the pairs that happen to be there, and be the time
-    of no image; so a live run and the session that it recorded have the same framesets. Only where another image
-    follows so closely that it would lie within the tolerance of this stamp is the frameset's that of its earliest pair.
+    The stamp of a pair is that of its left image, and the stamp of a frameset that of its first pair; a camera without
+    a partner counts as a pair that has no right image. A mean of stamps would depend on the pairs that are present, and
+    be the time of no image; this way, a live run and the session that it recorded have the same framesets. Only if
+    another image follows so closely that it would lie within the tolerance of this stamp, the frameset takes the stamp
+    of its earliest pair.
 
-    A frameset is complete once no image can join it any more, if each camera delivers its own images in order; cameras
-    may come in any order among each other. A camera that is past an instant has no image of it: one that lost an image,
-    a pair at half the rate or at instants of its own delays the others until its next image, and by ``max_wait_ms`` at
-    most. A pair that has been silent for a second is not waited for.
+    A frameset is complete once no image can join it any more, provided that each camera delivers its own images in
+    order; between cameras, any order is possible. A camera whose last image is later than an instant has no other image
+    of that instant. A camera that lost an image, and a pair at half the rate or at other instants, delay the others
+    until their next image, and by ``max_wait_ms`` at most. A pair that has been silent for a second is not waited for.
 
     The tolerance should be less than half of the shortest time between a camera's images.
 
     Args:
-        rig: with the names of the cameras, and the offsets of their stamps.
-        tolerance_ms: images whose stamps differ by no more are of the same instant.
-        max_wait_ms: longest time from an image's arrival until its frameset is returned, as far as any call gives the
-            time.
+        rig: the rig, with the names of the cameras and the offsets of their stamps.
+        tolerance_ms: images whose stamps differ by no more than this are of the same instant.
+        max_wait_ms: longest time from an image's arrival until its frameset is returned, where time passes only with
+            the arrival times that `add` and `advance` are given.
         report: takes events with the stamp of an image that is left out: ``image_without_partner``, ``late_image`` for
-            those not after the last frameset, ``duplicate_image``, ``image_future_stamp`` for one far ahead of those
-            before and after it, and ``unknown_camera``.
+            one that is not later than the last frameset, ``duplicate_image``, ``image_future_stamp`` for one far ahead
+            of those before and after it, and ``unknown_camera``.
     """
 
     def __init__(self, rig: Rig, tolerance_ms: float, max_wait_ms: float, report: Report) -> None:
@@ -59,9 +60,9 @@ class FramesetAssembler:
         """Add an image.
 
         Args:
-            camera: its name in the rig.
-            stamp_ns: on the clock of all cameras, without the camera's ``stamp_offset_s``, which is added here.
-            image: (height, width).
+            camera: name of the camera in the rig.
+            stamp_ns: stamp on the clock of all cameras, without the camera's ``stamp_offset_s``, which is added here.
+            image: the image (height, width).
             arrival_ns: host time of its arrival.
 
         Returns:
@@ -85,7 +86,7 @@ class FramesetAssembler:
         return list(self._due())
 
     def flush(self) -> list[FrameSet]:
-        """Return all framesets there are, as no more images will come."""
+        """Return all framesets that are left, when no more images will come."""
         framesets = []
         while entry := self._earliest():
             framesets.append(self._give(entry.stamp_ns))
@@ -135,7 +136,7 @@ class FramesetAssembler:
         )
 
     def _is_too_late(self, pair: _Group, camera: _Camera, image: _Arrived) -> bool:
-        """Whether an image cannot be in a frameset any more; the left one of a pair is what counts."""
+        """Return whether an image cannot join a frameset any more; a right one may be earlier by the tolerance."""
         if self._given_ns is None:
             return False
         slack_ns = 0 if camera is pair.left else self._tolerance_ns
@@ -162,7 +163,7 @@ class FramesetAssembler:
         return min((pair.matched[0] for pair in self._groups if pair.matched), key=_by_stamp, default=None)
 
     def _group(self, begin_ns: int) -> dict[int, _Matched]:
-        """Images of the frameset that begins with the earliest matched ones, by pair."""
+        """Return the images of the frameset whose earliest pair has this stamp: pair -> images."""
         group: dict[int, _Matched] = {}
         entries = ((entry.stamp_ns, number) for number, pair in enumerate(self._groups) for entry in pair.matched[:2])
         for stamp_ns, number in sorted(entries):
@@ -189,7 +190,7 @@ class FramesetAssembler:
         return all(at is not None and self._now_ns - at < _SILENT_NS for at in newest)
 
     def _may_deliver(self, pair: _Group, until_ns: int, is_in_group: bool) -> bool:
-        """Whether a pair may still have matched images up to a stamp, or up to what it has in the group."""
+        """Return whether a pair may get more matched images up to a stamp; in the group, only from waiting images."""
         if pair.right is None:
             return not (is_in_group or pair.left.is_past(until_ns))
         slack_ns = self._tolerance_ns
@@ -242,13 +243,13 @@ class _Camera:
     """The state of one camera.
 
     Attributes:
-        name: in the rig.
-        stamp_offset_ns: is added to its stamps.
+        name: name of the camera in the rig.
+        stamp_offset_ns: offset that is added to its stamps.
         waiting: images whose partner has not come, by stamp.
         seen: stamps of the newest images.
-        last_ns: stamp of the last image; the largest one would be wrong for ever if it was damaged.
-        newest_ns: latest arrival.
-        jumps: holds back an image that is far ahead.
+        last_ns: stamp of the last image; the largest stamp would stay wrong forever if it was damaged.
+        newest_ns: host time of the latest arrival.
+        jumps: filter that holds back an image whose stamp is far ahead.
     """
 
     def __init__(self, camera: Camera, report: Report) -> None:
@@ -263,13 +264,13 @@ class _Camera:
         )
 
     def is_past(self, stamp_ns: int) -> bool:
-        """Whether no image up to a stamp will come."""
+        """Return whether no image up to a stamp will come any more."""
         return self.last_ns is not None and self.last_ns > stamp_ns
 
 
 @dataclass(slots=True)
 class _Group:
-    """The cameras of a pair, or one without a partner, and matched images by stamp."""
+    """The cameras of a pair, or one camera without a partner, and their matched images by stamp."""
 
     cameras: tuple[_Camera, ...]
     matched: list[_Matched] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""From readings of devices to samples and framesets: stamps on one clock, images decoded, samples in order."""
+"""Conversion of device readings to IMU samples and framesets: stamps on one clock, images decoded, samples in order."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.rig import Imu, Rig
 from graphvio.sources.matching import TOLERANCE_NS
 
-_WAITING_IMAGES = 64  # for decoding
-_READ_AHEAD_IMAGES = 8  # likewise, of a source that waits
+_WAITING_IMAGES = 64  # images that wait to be decoded
+_READ_AHEAD_IMAGES = 8  # likewise, of a source that waits for its reader
 _MISSING_SAMPLE_MS = 10.0  # how long a sample that others overtook is waited for
 _ROUND_S = 0.05
-_MISSING_PERIODS = 1.5  # between samples: one is missing, or late
-_PERIODS = 50  # in the mean period,
-_MIN_PERIODS = 8  # which replaces the rig's from so many on
+_MISSING_PERIODS = 1.5  # time between samples, in periods, from which one in between is missing or late
+_PERIODS = 50  # number of newest periods that are averaged
+_MIN_PERIODS = 8  # number of periods from which their mean replaces the rig's nominal one
 _MAX_HELD = 1000
 
 Deliver = Callable[[Stage, Measurement, int], None]
@@ -34,21 +34,21 @@ Deliver = Callable[[Stage, Measurement, int], None]
 
 
 class Reception:
-    """The stages ``capture`` and ``decode``.
+    """The stages ``capture``, which takes readings from the source, and ``decode``, which makes framesets of images.
 
     Args:
-        source: opened.
-        rig: of the source.
-        config: of all stages.
+        source: the opened source.
+        rig: the source's rig.
+        config: configuration of all stages.
         meter: counts arrivals.
-        report: takes events of what is left out.
+        report: takes events on readings that are left out.
         deliver: takes samples and framesets, from both stages.
 
     Attributes:
-        images: that wait to be decoded, with their stamps on the host's clock.
-        started_ns: host time; readings from before are not used, as sensors may have been started long before.
+        images: images that wait to be decoded, with their stamps on the host's clock.
+        started_ns: host time of the start; earlier readings are not used, as sensors may have been started long before.
         last_ns: host time of the newest reading.
-        temperature_c: of the IMU, or None.
+        temperature_c: temperature of the IMU, or None.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Reception:
         self._report = report
         self._deliver = deliver
         self._clocks = ClockMaps(report)
-        self._shared = SharedClock(report)  # of the readings that name no clock
+        self._shared = SharedClock(report)  # clock of the readings that name none
         self._order = SampleOrder(_MISSING_SAMPLE_MS, (rig.imu or Imu()).rate_hz)
         set_ms = config.timing.simultaneous_ms
         tolerance_ms = 1e-6 * TOLERANCE_NS if set_ms is None else set_ms
@@ -77,7 +77,7 @@ class Reception:
         self.started_ns = self.last_ns = host_ns()
 
     def capture(self, stage: Stage) -> None:
-        """Sort the source's readings until its end."""
+        """Take the source's readings until its end: deliver IMU samples, and queue images for decoding."""
         for reading in self._source.readings():
             with stage.working():
                 self.last_ns = host_ns()
@@ -86,7 +86,7 @@ class Reception:
             self._deliver(stage, sample, host_ns())
 
     def decode(self, stage: Stage) -> None:
-        """Decode images and assemble them to framesets until there are no more."""
+        """Decode images and assemble them into framesets until there are no more."""
         while (item := self._next_image(stage)) is not None:
             frame, stamp_ns = item
             with stage.working():
@@ -95,7 +95,7 @@ class Reception:
                 except SourceError as error:
                     self._report(stamp_ns, EventKind.IMAGE_DAMAGED, str(error))
                     continue
-                # A source that waits delivers when it is read: how long others are waited for counts in its own time.
+                # A source that waits delivers when it is read: waiting times are then measured by its stamps.
                 at_ns = frame.arrival_ns if self._source.is_realtime else stamp_ns
                 for frameset in self._assembler.add(frame.camera, stamp_ns, image, at_ns):
                     self._deliver(stage, frameset, frame.arrival_ns)
@@ -126,16 +126,16 @@ class Reception:
             self._meter.count("images_not_decoded")
 
     def _mapped(self, reading: ImuReading | CameraFrame) -> int | None:
-        """Its stamp on the clock of all sensors, or None if it is implausible."""
+        """Return a reading's stamp on the clock of all sensors, or None if it is implausible."""
         if reading.clock is None:
             return self._shared.map("imu" if isinstance(reading, ImuReading) else reading.camera, reading.stamp_ns)
         return self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
 
     def _next_image(self, stage: Stage) -> tuple[CameraFrame, int] | None:
-        """Return the next image; None at the end. While none comes, framesets that have waited long enough go on."""
+        """Return the next image; None at the end. While none comes, deliver framesets that have waited long enough."""
         while (item := self.images.get(_ROUND_S)) is None and not self.images.is_finished:
             if not self._source.is_realtime:
-                continue  # its images come when they are taken: time means nothing for them
+                continue  # its images come when they are taken: the host's time does not count
             now_ns = host_ns()
             for frameset in self._assembler.advance(now_ns):
                 self._deliver(stage, frameset, now_ns)
@@ -143,12 +143,12 @@ class Reception:
 
 
 class SampleOrder:
-    """IMU samples in the order of their stamps, for links such as a network that let one overtake another.
+    """Puts IMU samples in the order of their stamps, for links such as a network on which one may overtake another.
 
-    A sample is held only where one is missing before it, so that none waits as long as none overtakes.
+    A sample is held only if one is missing before it, so that none waits as long as none overtakes another.
 
     Args:
-        max_wait_ms: how long the missing one is waited for, by the stamps of those that come.
+        max_wait_ms: how long a missing sample is waited for, measured by the stamps of the samples that come.
         rate_hz: nominal rate of the samples.
     """
 
@@ -162,9 +162,9 @@ class SampleOrder:
         self._steps_ns: deque[int] = deque(maxlen=_PERIODS)
 
     def add(self, sample: ImuSample) -> list[ImuSample]:
-        """Add a sample, and return those that go on, in order.
+        """Add a sample, and return the samples that are passed on, in order.
 
-        One that is older than those that went on goes on, too: the odometry reports it.
+        A sample that is older than those passed on before is passed on at once: the odometry reports it.
         """
         if self._given_ns is not None and sample.stamp_ns <= self._given_ns:
             return [sample]

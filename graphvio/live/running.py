@@ -34,19 +34,19 @@ class LiveOdometry:
     """Runs the odometry on a source until it ends or is stopped; implements `graphvio.slam.interface.Served`.
 
     Args:
-        source: opened.
-        rig: that opening the source returned.
-        config: of all stages.
+        source: the opened source.
+        rig: the rig that opening the source returned.
+        config: configuration of all stages.
         outputs: consumers of all measurements and results.
         wants_keyframes: whether keyframes are made.
 
     Attributes:
-        rig: of the source.
-        config: of all stages.
-        odometry: whose `predict` may be called from any thread.
-        estimates: of the framesets.
-        predictions: at each IMU sample.
-        events: of the run.
+        rig: the source's rig.
+        config: configuration of all stages.
+        odometry: the odometry, whose `predict` may be called from any thread.
+        estimates: broadcast of the estimates of the framesets.
+        predictions: broadcast of the predictions at each IMU sample.
+        events: broadcast of the run's events.
         keyframe_log: the newest keyframes.
     """
 
@@ -95,17 +95,17 @@ class LiveOdometry:
         self._outputs.append(output)
 
     def start(self) -> None:
-        """Start all threads; readings from before are not used."""
+        """Start all threads; readings from before the start are not used."""
         self._reception.start()
         for stage in self._stages:
             stage.start()
         self._watchdog.start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait for the end of the source, or a time, and return whether the run has ended.
+        """Wait for the end of the source, at most for a time, and return whether the run has ended.
 
         Raises:
-            GraphvioError: that ended a stage.
+            GraphvioError: the error that ended a stage.
         """
         ended = self._ended.wait(timeout_s)
         self._raise_failure()
@@ -114,11 +114,11 @@ class LiveOdometry:
     def stop(self) -> None:
         """Stop the source, process all that has come, and end all threads; a second call does nothing.
 
-        Threads are waited for as long as anything progresses. One that does not is reported as ``stage_stuck`` and left
-        behind, and those after it end without what it holds.
+        Threads are waited for as long as they make progress. One that makes none is reported as ``stage_stuck`` and
+        left behind, and the stages after it end without the items that it holds.
 
         Raises:
-            GraphvioError: that ended a stage.
+            GraphvioError: the error that ended a stage.
         """
         self._source.close()
         images, inbox, results = self._reception.images, self._estimation.inbox, self._estimation.results
@@ -133,9 +133,9 @@ class LiveOdometry:
         self._raise_failure()
 
     def _ends(self, stage: Stage) -> bool:
-        """Wait for a stage while it progresses, or those do that it waits for, and return whether it ended.
+        """Wait for a stage while it, or the stages that it waits for, make progress; return whether it ended.
 
-        Capture has to end at once where it need not wait, as its source was closed.
+        In real time, capture waits for no stage, and has to end within `_END_S` as its source was closed.
         """
         capture, *later = self._stages
         counted = later if not self._source.is_realtime else [stage] if stage is not capture else []
@@ -159,7 +159,7 @@ class LiveOdometry:
 
     @property
     def map_T_odom(self) -> Float | None:
-        """The correction in force, (4, 4), or None before the epoch's first."""
+        """The correction in force (4, 4), or None before the first correction of the epoch."""
         return self._front_end.map_T_odom
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
@@ -237,7 +237,7 @@ class LiveOdometry:
             self._report(event.stamp_ns, event.kind, event.detail)
 
     def _fail(self, stage: Stage, error: BaseException) -> None:
-        """Close the source as a stage is dead, so that all others come to their end."""
+        """Report a stage that failed, and close the source, so that all other stages come to their end."""
         self._failures.append(error)
         with suppress(Exception):  # an output may be what failed
             self._report_now(EventKind.STAGE_FAILED, f"{stage.name}: {error}")
@@ -245,7 +245,7 @@ class LiveOdometry:
         self._source.close()
 
     def _silences_s(self) -> Mapping[str, float]:
-        """For how long nothing has come, by kind of sensor, of those that should deliver."""
+        """Return the time since the last reading by kind of sensor, of the kinds that should deliver."""
         if not (self._source.is_realtime and self._stages[0].is_alive):
             return {}
         awaited = {"cameras": "images"} | ({} if self.rig.imu is None else {"imu": "imu_samples"})
@@ -257,7 +257,7 @@ class LiveOdometry:
 
     def _raise_failure(self) -> None:
         if self._failures:
-            raise self._failures[0]  # later ones may be its consequences
+            raise self._failures[0]  # later ones may be consequences of it
 
     def _close_broadcasts(self) -> None:
         self.keyframe_log.close()

@@ -1,4 +1,4 @@
-"""Recording of a live run as a session, in a thread of its own: a slow disk never holds up the odometry."""
+"""Recording of a live run as a session, in a thread of its own, so that a slow disk never holds up the odometry."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from graphvio.rig import Rig
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
-_FRAMESETS = "framesets"  # a lane
-_WAITING = 20_000  # samples, poses and events: a minute of them
-_WAITING_FRAMESETS = 120  # a disk may pause for seconds
-_READ_AHEAD = 2  # framesets, where the source waits
+_FRAMESETS = "framesets"  # a lane of the queue
+_WAITING = 20_000  # samples, poses and events that may wait: those of a minute
+_WAITING_FRAMESETS = 120  # framesets that may wait, as a disk may pause for seconds
+_READ_AHEAD = 2  # framesets that may wait if the source waits for its reader
 
-_Write = tuple[Callable[[Any], None], Any]  # a function of the writer, and what it is to write
+_Write = tuple[Callable[[Any], None], Any]  # a method of the writer, and its argument
 
 
 class SessionRecorder(Output):
-    """Writes all measurements, estimates and events.
+    """Writes all measurements, estimates and events of a live run to a session file.
 
-    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses, too, when it
-    has been stuck for more than a minute.
+    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses are, too,
+    when it has been stuck for more than a minute.
 
     Args:
-        path: of the session, a new file.
-        rig: of the framesets.
+        path: path of the session, a new file.
+        rig: the rig of the framesets.
         image_format: ``raw``, or ``png`` to compress images.
-        waits: whether to wait for the disk instead, for a source that waits itself.
+        waits: whether to wait for the disk instead, for a source that itself waits for its reader.
 
     Attributes:
         failure: newest error of writing, or None.
@@ -83,7 +83,7 @@ class SessionRecorder(Output):
         }
 
     def close(self) -> None:
-        """Write all that waits, and finish the file."""
+        """Write everything that waits, and finish the file."""
         self._queue.close()
         self._thread.join()
 

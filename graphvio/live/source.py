@@ -1,4 +1,4 @@
-"""The interface of live sources, and some of a live source's cameras."""
+"""The interface of live sources, and a live source with only some of its cameras."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class LiveSource(Protocol):
 
     @property
     def name(self) -> str:
-        """Name for people, and fit for the name of a file."""
+        """Name for people, which can also be used in file names."""
 
     @property
     def is_realtime(self) -> bool:
-        """Whether readings arrive at the sensors' pace; else the source waits for its reader, and loses nothing."""
+        """Whether readings arrive in real time; otherwise the source waits for its reader, and loses nothing."""
 
     def open(self) -> Rig:
         """Start the devices.
 
         Returns:
-            The rig that was given, or the factory's calibration.
+            The rig that the source was given, or one with the factory's calibration.
 
         Raises:
             SourceError: if a device is missing or cannot be started.
@@ -43,22 +43,22 @@ class LiveSource(Protocol):
     def readings(self) -> Iterator[Reading]:
         """Yield readings in the order of arrival, until the end of the source or `close`.
 
-        A lost device is reported by a `Notice` and read on when it is back; it never raises.
+        A lost device is reported by a `Notice`, and never raises; its readings continue when it is back.
         """
 
     def health(self) -> Sequence[DeviceHealth]:
-        """Return the state of each device; from any thread."""
+        """Return the state of each device; may be called from any thread."""
 
     def close(self) -> None:
-        """Stop the devices and end `readings`; from any thread, a second call does nothing."""
+        """Stop the devices and end `readings`; may be called from any thread, a second call does nothing."""
 
 
 class SelectedCameras:
     """A `LiveSource` without the images of cameras that are not used.
 
     Args:
-        source: not opened yet.
-        choose: returns the rig to use of the source's rig; may raise RigError.
+        source: the source, not opened yet.
+        choose: takes the source's rig and returns the part of it to use; may raise RigError.
     """
 
     def __init__(self, source: LiveSource, choose: Callable[[Rig], Rig]) -> None:

@@ -1,4 +1,4 @@
-"""The threads of a live run, and the watchdog that reports those that are stuck and sensors that are silent."""
+"""The threads of a live run, and the watchdog that reports stuck threads and silent sensors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Stage:
     """A thread that works on one item after the other.
 
     Args:
-        name: of the stage, for people.
+        name: name of the stage, for people.
         body: runs until there is nothing more to do; works on each item inside of `working`.
         on_failure: called in the thread with an error that ended the body.
         at_end: called in the thread after the body, and after ``on_failure``.
@@ -52,7 +52,7 @@ class Stage:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Mark a wait for the next stage inside of `working`: that one is stuck then, and this one is not."""
+        """Mark a wait for the next stage inside of `working`: only the next one can be stuck in the meantime."""
         is_working = self._busy_since_s is not None
         self._busy_since_s = None
         try:
@@ -67,7 +67,7 @@ class Stage:
 
     @property
     def busy_s(self) -> float:
-        """Time since the work on the present item or part began."""
+        """Time since the work on the present item, or part of it, began; zero if there is none."""
         since_s = self._busy_since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
 
@@ -88,7 +88,7 @@ class Stage:
     def _run(self) -> None:
         try:
             self._body(self)
-        except BaseException as error:  # of any kind: the other stages must end, too
+        except BaseException as error:  # any kind of error: the other stages must end, too
             self.failure = error
             self._on_failure(self, error)
         finally:
@@ -100,10 +100,10 @@ class Watchdog:
     """Monitors stages and sensors from a thread of its own.
 
     Args:
-        stages: to be monitored.
-        stuck_s: an item that takes longer is stuck, and sensors from which nothing came for longer are silent.
+        stages: the stages to monitor.
+        stuck_s: a stage whose item takes longer is stuck, and a sensor that delivers nothing for longer is silent.
         report: takes kind and detail of an event, when such a state begins and when it ends.
-        silences_s: returns for how long nothing has come, by kind of sensor, of those that should deliver.
+        silences_s: returns the time since the last reading by kind of sensor, of the kinds that should deliver.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class Watchdog:
         while not self._stop.wait(_ROUND_S):
             try:
                 self._check()
-            except Exception:  # of an output that takes the event: stages are monitored on
+            except Exception:  # in an output that takes the event: monitoring goes on
                 _log.exception("an event could not be reported")
 
     def _check(self) -> None:

@@ -1,4 +1,4 @@
-"""Chains of places by the odometry alone, with the covariance of the motion between any two places of one."""
+"""Chains of places by the odometry alone, with the covariance of the motion between any two places of a chain."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.optimization.solver import Edge
 
 EXACT: Final = 1e-12 * np.eye(6)
-"""Covariance of a micrometre and a microradian, which keeps a covariance of zero invertible."""
+"""Covariance with sigmas of a micrometre and a microradian, which makes a covariance of zero invertible."""
 
 
 class Chains:
-    """Places in the order of time, in fragments: chains of motions with independent errors.
+    """Places in the order of time, divided into fragments: chains of motions with independent errors.
 
-    The covariance of a motion between two places is a difference of two sums, so its cost is constant.
+    The covariance of the motion between two places is the difference of two stored sums, so its cost is constant.
 
     Attributes:
         first_places: Index of each fragment's first place.
@@ -43,16 +43,16 @@ class Chains:
 
     @property
     def fragments(self) -> list[range]:
-        """Range of the places of each fragment."""
+        """Indices of the places of each fragment, as a range."""
         ends = [*self.first_places[1:], len(self)]
         return [range(start, end) for start, end in zip(self.first_places, ends, strict=True)]
 
     def fragment(self, place: int) -> int:
-        """Return the fragment of a place."""
+        """Return the number of a place's fragment."""
         return int(np.searchsorted(self.first_places, place, side="right")) - 1
 
     def begin(self, odom_T_body: Float) -> None:
-        """Add a fragment with its first place (4, 4), in its odom frame."""
+        """Add a fragment, given the pose (4, 4) of its first place in its odom frame."""
         self.first_places.append(len(self))
         self._append(np.eye(4), np.zeros((6, 6)), odom_T_body, np.zeros((6, 6)))
 
@@ -79,7 +79,7 @@ class Chains:
             graph.add(self._factors[place])
 
     def prior(self, fragment: int) -> gtsam.NonlinearFactor:
-        """Return the prior of a fragment's first place, which defines its frame and is therefore certain."""
+        """Return the prior of a fragment's first place, whose pose defines the frame and is therefore certain."""
         start = self.first_places[fragment]
         return gtsam.PriorFactorPose3(x(start), gtsam.Pose3(self.poses[start]), gaussian(EXACT))
 

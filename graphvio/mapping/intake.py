@@ -1,4 +1,4 @@
-"""Reads keyframes as fast as they come, and queues those that are places."""
+"""Intake of the mapper: reads keyframes as fast as they come, and queues those that become places."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from graphvio.mapping.places import KeyframeAtPlace, NewPlace, PlaceChooser
 from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.slam.interface import SlamFrontEnd
 
-_MAX_WAITING = 8  # places, with their images
+_MAX_WAITING = 8  # places that may wait, with their images
 
 
 class Intake:
     """Reads a front-end's keyframes in a thread of its own, so that the front-end never waits.
 
     While too many places wait, no keyframe becomes a place: the map gets coarser, but does not fall behind. ``share``
-    is asked before each keyframe for the share of the distances between places that is sufficient now.
+    is called before each keyframe; it returns the share of the configured distance and angle that suffices now for the
+    next place.
 
     Attributes:
         skipped: Number of keyframes that did not become places because too many waited.
@@ -38,7 +39,7 @@ class Intake:
 
     @property
     def waiting(self) -> int:
-        """Number of places in the queue."""
+        """Number of places that wait in the queue."""
         return len(self._waiting)
 
     @property
@@ -59,7 +60,7 @@ class Intake:
         """Wait for the next place; None after the last one.
 
         Raises:
-            GraphvioError: The front-end's error, after all places before it; a MapError if keyframes have no images.
+            GraphvioError: An error of the front-end, after all earlier places; a MapError if keyframes have no images.
         """
         place = self._waiting.get()
         if place is None and self._failure is not None:

@@ -33,20 +33,20 @@ from graphvio.rig import Rig
 from graphvio.slam.interface import SlamFrontEnd
 from graphvio.trajectory import Trajectory
 
-_SEARCHING_SHARE = 0.25  # of the places' distance while a fragment is not located in the map,
-_MAX_SEARCHING_PLACES = 20  # for its first places: later, denser places do not locate it sooner
+_SEARCHING_SHARE = 0.25  # of the distance between places, while a fragment is not yet located in the map
+_MAX_SEARCHING_PLACES = 20  # first places of a fragment that are denser: more would not locate it sooner
 
 
 class Mapper:
     """Makes a map from a front-end's keyframes, and corrects the front-end; a context manager.
 
-    The map's frame is the odom frame of the first epoch, or the loaded map's. A later epoch, or a session in a loaded
-    map, is a separate fragment until closures of three of its places agree on where it is; only then the front-end is
-    corrected.
+    The map's frame is the odom frame of the first epoch, or the frame of the loaded map. A later epoch, or a session in
+    a loaded map, is a separate fragment until closures of three of its places agree on its transform; only then is the
+    front-end corrected.
 
     Args:
         front_end: The front-end, such as `graphvio.slam.FrontEnd`; its keyframes must have images.
-        config: Its section ``optimization`` has the settings of places and closures.
+        config: The configuration, whose section ``optimization`` has the settings of places and closures.
         map: Folder of a saved map to begin with, or None.
         folder: Empty folder for temporary files, removed by `close`; None for one in the system's folder.
 
@@ -72,7 +72,7 @@ class Mapper:
         self._graph = PoseGraph(settings.loop_probability)
         self._recognition = Recognition(self._config.motion.seed)
         self._places: list[Place] = []
-        self._body_T_camera: list[Float] = []  # of the first camera, by the rig that was in force at each place
+        self._body_T_camera: list[Float] = []  # pose of the first camera, with the calibration in force at each place
         if folder is not None:
             kept = saved_map.load(folder, self._front_end.rig, self._config)
             copy_database(folder / DATABASE, self._folder / DATABASE)
@@ -82,7 +82,7 @@ class Mapper:
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._front_end.rig)
         self._observer = PlaceObserver(self._front_end.rig, self._config)
-        self._share = _SEARCHING_SHARE if self._first else 1.0  # of the distance between places
+        self._share = _SEARCHING_SHARE if self._first else 1.0  # of the configured distance between places
         self._intake = Intake(self._front_end, settings, lambda: self._share)
         self._keyframe_ids: list[int] = []
         self._lock = threading.RLock()  # held while the graph changes, or is read in another thread
@@ -92,7 +92,7 @@ class Mapper:
         self._tried = 0
         self._sent = 0
         self._refused: list[str] = []
-        if self._first and not self._recognition.words.size:  # a map of too few places for a vocabulary, until now
+        if self._first and not self._recognition.words.size:  # the map had too few places for a vocabulary
             self._recognition.learn(self._descriptors)
 
     def __enter__(self) -> Mapper:
@@ -120,14 +120,14 @@ class Mapper:
         self._intake.stop()
 
     def close(self) -> None:
-        """Delete the temporary files; `save` the map before."""
+        """Delete the temporary files; `save` has to be called before to keep the map."""
         self.stop()
         with self._working:
             self._store.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def save(self, folder: Path | str) -> None:
-        """Write the map to a folder, where it replaces an older one; thread-safe, between two places.
+        """Write the map to a folder, where it replaces an older map; thread-safe, runs between two places.
 
         Raises:
             MapError: If the folder contains other files, or cannot be written.
@@ -156,7 +156,7 @@ class Mapper:
 
     @property
     def closures(self) -> list[tuple[LoopClosure, bool]]:
-        """All closures, and whether the solution uses them; rows of their places are indices of the map's places."""
+        """All closures, and whether the solution uses each; rows of their places are indices of the map's places."""
         with self._lock:
             return [(each.closure, each.is_used) for each in self._graph.closures]
 
@@ -184,7 +184,7 @@ class Mapper:
     def _take(self, new: NewPlace) -> None:
         keyframe, clock = new.keyframe, self._times
         rig = keyframe.calibrated_rig or self._front_end.rig
-        if rig is not self._store.rig:  # see the place, and stored ones, with the calibration that is in force
+        if rig is not self._store.rig:  # use the calibration in force for this place and the stored ones
             self._store.rig, self._observer = rig, PlaceObserver(rig, self._config)
         frameset = FrameSet(keyframe.stamp_ns, keyframe.images)
         with clock.stage("features"):
@@ -247,15 +247,15 @@ class Mapper:
         return replace(closure, reference_T_current=self._body_T_body_now(earlier) @ closure.reference_T_current)
 
     def _body_T_body_now(self, place: int) -> Float:
-        """Return body by the rig that is in force now (4, 4) in body as it was in force at a place.
+        """Return the pose (4, 4) of body by the present calibration, in body by the calibration in force at a place.
 
-        Poses of places are by the calibration of then, and what is measured between places is by that of now. What
-        stays is where the cameras were.
+        The poses of places refer to body by the calibration of their time, and motions that are measured between places
+        to body by the present one. The poses of the cameras do not depend on this.
         """
         return np.asarray(self._body_T_camera[place] @ se3_inverse(_body_T_camera(self._store.rig)))
 
     def _neighbours(self, number: int) -> list[tuple[PlaceView, PlaceMotion]]:
-        """Return the places next to a place in its chain, and the motions to them."""
+        """Return the places next to a place in its fragment, and the motions to them."""
         found: list[tuple[PlaceView, PlaceMotion]] = []
         chains = self._graph.chains
         for other in (number + step for step in NEIGHBOURS):
@@ -274,13 +274,13 @@ class Mapper:
             self._correct(number)
 
     def _correct(self, number: int) -> None:
-        """Send the front-end the pose of a place of this session in the map."""
+        """Send the front-end the pose in the map of a place of this session."""
         with self._lock:
             pose, covariance = self._graph.pose(number), self._graph.covariance(number)
         self._sent += 1
         try:
             result = self._front_end.correct(self._keyframe_ids[number - self._first], pose, covariance)
-        except GraphvioError as error:  # also if it has ended, which its keyframes show
+        except GraphvioError as error:  # also if the front-end has ended, which `Intake` notices
             self._refused.append(str(error))
             return
         if not result.accepted:
@@ -296,7 +296,7 @@ class Mapper:
 
 
 def _body_T_camera(rig: Rig) -> Float:
-    """Return the place (4, 4) of a rig's first camera, relative to which those of the others are known."""
+    """Return the pose (4, 4) of a rig's first camera in body; those of the others are known relative to it."""
     return rig.groups[0].left.body_T_cam
 
 

@@ -29,7 +29,7 @@ class KeyframeAtPlace:
 
     stamp_ns: int  # stamp of the keyframe
     place: int  # index of the place
-    place_T_body: Float  # (4, 4) by the odometry; closures move the place
+    place_T_body: Float  # (4, 4) from the odometry; closures move only the place
 
 
 class PlaceChooser:
@@ -40,16 +40,16 @@ class PlaceChooser:
         self._angle_deg = angle_deg
         self._last: Keyframe | None = None
         self._begins = True
-        self._count = 0  # of places
+        self._count = 0  # number of places
         self._motion = np.eye(4)
         self._covariance = np.zeros((6, 6))
 
     def add(self, keyframe: Keyframe, share: float = 1.0, has_room: bool = True) -> tuple[NewPlace | None, bool]:
-        """Add the next keyframe; returns the place, if it is one, and whether it qualifies, with or without room.
+        """Add the next keyframe; returns the place, if it becomes one, and whether it qualifies, regardless of room.
 
         Args:
             keyframe: The keyframe; ids increase.
-            share: Sufficient share of distance and angle: less than one for denser places.
+            share: Share of the configured distance or angle that suffices: less than one for denser places.
             has_room: Whether a place can be queued; if not, the next keyframe can become one.
         """
         last = self._last
@@ -71,7 +71,7 @@ class PlaceChooser:
         return place, True
 
     def newest(self) -> KeyframeAtPlace | None:
-        """Return the newest keyframe's relative pose; None as long as its fragment has no place."""
+        """Return the newest keyframe's pose relative to its place; None as long as its fragment has no place."""
         if self._last is None or self._begins:
             return None
         return KeyframeAtPlace(self._last.stamp_ns, self._count - 1, self._motion)
@@ -85,8 +85,8 @@ class PlaceChooser:
 def motion_between(last: Keyframe, keyframe: Keyframe) -> tuple[Float, Float]:
     """Return ``last_T_body`` (4, 4) of two keyframes of an epoch, and its covariance (6, 6) in body at the second.
 
-    If keyframes between them are lost, or the odometry reports no motion, it follows from their poses in odom, whose
-    errors are assumed to be independent. This is pessimistic: common errors cancel out.
+    If keyframes between them are lost, or the odometry reports no motion, the motion follows from their poses in odom,
+    whose errors are assumed to be independent. This is pessimistic, as errors in common would cancel out.
     """
     motion = se3_inverse(last.odom_T_body) @ keyframe.odom_T_body
     covariance = keyframe.relative_covariance
@@ -104,9 +104,9 @@ def composed(
 
     Args:
         a_T_b: (4, 4) first motion.
-        a_covariance: (6, 6) of ``a_T_b``, in b; with ``begins`` of the pose of a, in a.
+        a_covariance: (6, 6) covariance of ``a_T_b``, in b; with ``begins``, that of the pose of a, in a.
         b_T_c: (4, 4) second motion.
-        b_covariance: (6, 6) of ``b_T_c``, in c.
+        b_covariance: (6, 6) covariance of ``b_T_c``, in c.
         begins: Whether the first covariance is that of the pose of a.
     """
     adjoint = se3_adjoint(se3_inverse(a_T_b if begins else b_T_c))
@@ -121,9 +121,9 @@ def spread_keyframes(
 ) -> Trajectory:
     """Return the trajectory of all keyframes, given the places' poses.
 
-    Between two places the odometry's chain is kept, and its error at the second place is distributed over time. A pose
-    is None where the place is not in the map, a motion that from the previous place; ``begins`` are the fragments'
-    first places.
+    Between two places, the odometry's chain is kept, and its error at the second place is distributed over time. A pose
+    is None if the place is not in the map; ``motions`` are those from the previous place to each place, and ``begins``
+    the fragments' first places.
     """
     stamp_of: dict[int, int] = {}
     for each in keyframes:

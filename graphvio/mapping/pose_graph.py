@@ -1,8 +1,8 @@
 """The map's pose graph: chains of places, and the closures between them.
 
-A closure that contradicts the odometry between its ends is refuted for good. One that is consistent with the present
-solution is used; others are doubted. When there are enough doubted closures, or closures that join fragments, all
-closures are tested again together, as for recorded sessions (`graphvio.optimization.consistency`).
+A closure that contradicts the odometry between its ends is refuted for good. A closure that is consistent with the
+present solution is used; others are doubted. When there are enough doubted closures, or closures that join fragments,
+all closures are tested again together, as for recorded sessions (`graphvio.optimization.consistency`).
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from graphvio.optimization.consistency import Joined, consistent, join_fragments
 from graphvio.optimization.loops.closures import LoopClosure
 from graphvio.optimization.solver import Edge, Marginals, solve
 
-_MAX_VOTES = 30  # for the transform between two fragments: votes are compared with each other
-_MIN_DOUBTS = 3  # before all closures are tested again,
-_MIN_DOUBTED_SHARE = 0.1  # and this share of those that are used
-_MAX_RECONSIDERED = 50  # newest doubted closures that are used as soon as the solution agrees with them
-_MAX_SIGHT_M = 10.0  # places that are farther apart have little in common that stereo measures well;
-_SIGHT_SIGMAS = 4.0  # standard deviations of both positions that are added
-_MAX_ROUNDS = 3  # in which rejected closures are used that the solution agrees with
+_MAX_VOTES = 30  # closures that vote for the transform between two fragments: each is compared with all others
+_MIN_DOUBTS = 3  # number of doubted closures from which all closures are tested again
+_MIN_DOUBTED_SHARE = 0.1  # the same as a share of the used closures; the larger number counts
+_MAX_RECONSIDERED = 50  # newest closures, of which doubted ones are used as soon as the solution agrees with them
+_MAX_SIGHT_M = 10.0  # places that are farther apart have little in common that stereo measures well
+_SIGHT_SIGMAS = 4.0  # standard deviations of both positions that are added to this distance
+_MAX_ROUNDS = 3  # in which rejected closures are used after all if the solution agrees with them
 
 
 @dataclass(eq=False)
@@ -52,12 +52,12 @@ class PoseGraph:
     """Places and their poses; a component of joined fragments has the frame of its first fragment.
 
     Args:
-        probability: Share of the chi-square distribution beyond which a closure is rejected.
+        probability: Probability of the quantile of the chi-square distribution beyond which a closure is rejected.
         chains: Chains of an earlier map.
         closures: Closures of an earlier map.
-        poses: (N, 4, 4) solution of an earlier map.
+        poses: (N, 4, 4) poses of an earlier map.
         component: For each of its fragments, the fragment in whose frame it is.
-        bounds: (N, 6, 6) covariances of the poses.
+        bounds: (N, 6, 6) covariances of the poses, or upper bounds of them.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class PoseGraph:
         self._poses = list(poses)
         self._component = list(component)
         self._bounds = list(bounds)
-        self._marginals_of: dict[int, Marginals] = {}  # of components that have not changed since
+        self._marginals_of: dict[int, Marginals] = {}  # component -> marginals, if it has not changed since
         self._doubts = 0
 
     def __len__(self) -> int:
@@ -115,7 +115,7 @@ class PoseGraph:
         return self._marginals(self._component_of(place)).variable(x(place))
 
     def may_see(self, one: int, other: int) -> bool:
-        """Return whether two places may be near enough to see the same; true for places of different components."""
+        """Return whether two places may be near enough to see the same points; true if in different components."""
         if self._component_of(one) != self._component_of(other):
             return True
         sigma_m = sum(float(np.sqrt(np.trace(self._bounds[place][3:, 3:]))) for place in (one, other))
@@ -123,7 +123,7 @@ class PoseGraph:
         return bool(distance_m <= _MAX_SIGHT_M + _SIGHT_SIGMAS * sigma_m)
 
     def add_closures(self, found: Sequence[LoopClosure]) -> bool:
-        """Test and add closures, whose rows are the graph's places; returns whether the solution has changed.
+        """Test and add closures, whose rows are places of the graph; returns whether the solution has changed.
 
         Raises:
             OptimizationError: If the graph cannot be solved.
@@ -154,7 +154,7 @@ class PoseGraph:
         return is_new
 
     def _take_up_doubted(self, root: int) -> bool:
-        """Use doubted closures of a component with which the solution agrees by now."""
+        """Use the doubted closures of a component that the solution agrees with by now; return whether any are."""
         taken = False
         for each in self.closures[-_MAX_RECONSIDERED:]:
             ends = {self._component_of(each.edge.first), self._component_of(each.edge.second)}
@@ -165,7 +165,7 @@ class PoseGraph:
         return taken
 
     def _test_all(self) -> bool:
-        """Select the consistent closures, beginning from the odometry alone, and solve."""
+        """Select the consistent closures again from the odometry alone, and solve; returns whether anything changed."""
         self._doubts = 0
         before = [each.is_used for each in self.closures], self._component
         joined, fragments = self._joined(), self.chains.fragments
@@ -185,7 +185,7 @@ class PoseGraph:
                 each.is_used = bool(is_accepted)
             for root in set(self._component):
                 self._solve(root)
-            # Rejected too soon: the odometry does not refute them, and the solution without them agrees with them.
+            # These were rejected too soon: the odometry does not refute them, and the solution without them agrees.
             again = [k for k in np.flatnonzero(~accepted & (distances <= self._limit)).tolist() if self._fits(edges[k])]
             if not again:
                 break
@@ -199,14 +199,14 @@ class PoseGraph:
         return root == self._component_of(edge.second) and edge.distance(self._marginals(root)) <= self._limit
 
     def _moved(self, joined: Joined) -> Float:
-        """Return the poses (N, 4, 4) by the odometry alone, in the components' frames."""
+        """Return the poses (N, 4, 4) from the odometry alone, in the joined components' frames."""
         poses = np.array(self.chains.poses)
         for frame, states in zip(joined.frames, self.chains.fragments, strict=True):
             poses[states.start : states.stop] = frame @ poses[states.start : states.stop]
         return poses
 
     def _held_together(self, joined: Joined, used: Sequence[Edge]) -> Joined:
-        """Return only those joints that used closures hold together: other fragments would be free."""
+        """Return only those joins of fragments that used closures support: others would leave a fragment free."""
         root = list(range(len(joined.component)))
         for edge in used:
             ends = root[self.chains.fragment(edge.first)], root[self.chains.fragment(edge.second)]
@@ -215,7 +215,7 @@ class PoseGraph:
         return Joined(frames, root)
 
     def _joined(self) -> Joined:
-        """Return the transforms between fragments by votes of closures, one for each place."""
+        """Join fragments by votes of closures: one for each place and fragment that it is matched with."""
         strongest: dict[tuple[int, int], TestedClosure] = {}
         for each in self.closures:
             first, second = self.chains.fragment(each.edge.first), self.chains.fragment(each.edge.second)
@@ -232,7 +232,7 @@ class PoseGraph:
             for each in sorted(of_two, key=lambda each: -each.closure.inliers)[:_MAX_VOTES]
         ]
         fragments, edges = self.chains.fragments, [each.edge for each in voters]
-        # In the present solution: by the odometry alone, two views of a place may be farther apart than votes may.
+        # Votes are compared in the present solution: by the odometry alone, those that agree may be too far apart.
         now = join_fragments(fragments, np.array(self._poses), edges, [each.closure.inliers for each in voters])
         seen_at = {self.chains.fragment(edge.second): edge.second for edge in reversed(edges)}
         frames = []
@@ -249,7 +249,7 @@ class PoseGraph:
         return [number for number, of in enumerate(self._component) if of == root]
 
     def _graph(self, root: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Return the graph of one component: METIS, which orders variables, fails on disconnected graphs."""
+        """Return the graph of one component, as METIS, which orders variables, fails on disconnected graphs."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         graph.add(self.chains.prior(root))
         fragments = self.chains.fragments

@@ -25,12 +25,12 @@ from graphvio.viewer import Viewer, WebOptions
 from graphvio.warmup import warm_up
 
 _MAP_COLOUR, _ODOM_COLOUR = (40, 190, 90), (150, 150, 150)
-_VIEWED_EVERY = 3  # places
+_VIEWED_EVERY = 3  # places after which the map's path is shown again
 
 
 @dataclass(frozen=True)
 class MappingTask:
-    """Options of the process; those that are known only when the odometry runs have defaults."""
+    """Options of the mapping process; those that are known only when the odometry runs have defaults."""
 
     map: Path | None = None  # folder of a saved map to begin with, or None
     out: Path | None = None  # folder for the new map, or None
@@ -38,7 +38,7 @@ class MappingTask:
     web_port: int | None = None  # port of the view in a browser, or None
     save_rrd: Path | None = None  # file for the viewer's data, or None
     address: str = ""  # address of the odometry's service
-    config: Config = field(default_factory=Config)  # of the odometry, with the settings of places and closures
+    config: Config = field(default_factory=Config)  # the odometry's configuration, with settings of places and closures
     # empty folder for temporary files, removed at the end; None for one in the system's folder
     folder: Path | None = None
 
@@ -46,7 +46,7 @@ class MappingTask:
 def run_mapping(task: MappingTask, ready: Event) -> str:
     """Map until the odometry ends, and save the map; to be called in a process of its own, which then ignores signals.
 
-    After a failure, the map until then is saved. ``ready`` is set when keyframes may come. Returns a summary in a line.
+    After a failure, the map until then is saved. ``ready`` is set when keyframes may come. Returns a one-line summary.
 
     Raises:
         GraphvioError: If the odometry cannot be reached, or the map cannot be used or written.
@@ -69,7 +69,7 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
 
 
 class ClientWithImages:
-    """A client as a front-end whose keyframes have images, as the mapper needs them."""
+    """A front-end made of a client, whose keyframes have the images that the mapper needs."""
 
     def __init__(self, client: Client) -> None:
         self.rig = client.rig
@@ -127,7 +127,7 @@ def _follow(client: Client, mapper: Mapper, task: MappingTask, ready: Event) -> 
 
 
 class _OdomPath:
-    """Shows the estimates as they come, and records their path."""
+    """Shows the odometry's estimates in the viewer as they come, and records their path."""
 
     def __init__(self, client: Client, viewer: Viewer) -> None:
         self._client = client

@@ -1,4 +1,4 @@
-"""Retrieval of similar places, by a vocabulary that is learnt as places come."""
+"""Retrieval of similar places by a vocabulary of visual words, which is learnt as places come."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ import numpy as np
 from graphvio.arrays import AnyArray, Int
 from graphvio.optimization.loops.retrieval import describe, most_similar, vocabulary
 
-_MIN_PLACES = 8  # of which a vocabulary is learnt,
-_MAX_PLACES = 256  # and learnt again when their number has doubled, up to these: more would not change the words
+_MIN_PLACES = 8  # number of places from which the first vocabulary is learnt
+_MAX_PLACES = 256  # it is learnt again whenever their number has doubled, up to this: more would not change the words
 
 
 class Recognition:
-    """Places as vectors of visual words; ``words`` (W, 128) were learnt from so many places of an earlier map."""
+    """Describes places by vectors of visual words, and finds similar ones.
+
+    ``words`` (W, 128) is the vocabulary of an earlier map, ``learnt_from`` the number of places it was learnt from.
+    """
 
     def __init__(self, seed: int, words: AnyArray | None = None, learnt_from: int = 0) -> None:
         self.words = np.zeros((0, 128), dtype=np.float32) if words is None else words
         self.learnt_from = learnt_from
         self._seed = seed
-        self._pairs: list[list[int]] = []  # of each place
+        self._pairs: list[list[int]] = []  # pairs that have an image at each place
         self._first_rows: list[int] = []
         self._vectors = np.zeros((0, self.words.size), dtype=np.float32)
         self._rows = 0
@@ -50,7 +53,7 @@ class Recognition:
             self._rows += 1
 
     def learn(self, descriptors: Callable[[int, int], AnyArray]) -> None:
-        """Learn the vocabulary from all places' descriptors, given by place and pair, and describe them by it."""
+        """Learn the vocabulary from all places' descriptors, given by place and pair, and describe all places again."""
         images = [(place, j) for place, pairs in enumerate(self._pairs) for j in pairs]
         self.words = vocabulary((descriptors(*image) for image in images), len(images), self._seed)
         self.learnt_from = len(self)
@@ -59,7 +62,7 @@ class Recognition:
             self._vectors[row] = describe(descriptors(*image), self.words)
 
     def similar(self, place: int, may: Callable[[int], bool], max_count: int) -> list[int]:
-        """Return the earlier places that are most similar to a place, of those that may be compared with it."""
+        """Return the earlier places that are most similar to a place, among those for which ``may`` returns True."""
         if not place or not self.words.size or not self._pairs[place]:
             return []
         # First rows of places without an image belong to other places.

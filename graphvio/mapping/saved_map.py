@@ -2,7 +2,8 @@
 
 ``map.json`` is the header, with the version and the digests of the other files; ``map.npz`` has the places and chains,
 ``closures.npz`` the closures, ``features.db`` (COLMAP's database) the features, ``rig.yaml`` the rig. Images are not
-saved: several closures by features alone locate a session as well as patches would, in a third of the space.
+saved: several closures from features alone locate a session as well as registered patches would, in a third of the
+space.
 """
 
 from __future__ import annotations
@@ -35,22 +36,22 @@ FORMAT, VERSION = "graphvio map", 3
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
 _DIGESTED = (_PLACES, _CLOSURES, DATABASE)
 _OWN = (_HEADER, _RIG, *_DIGESTED)
-_RIG_TOLERANCE = 1e-9  # a file has all digits; this is rounding
+_RIG_TOLERANCE = 1e-9  # a file has all digits, so that only rounding differs
 
 
 class SavedMap(NamedTuple):
-    """What a map consists of."""
+    """The contents of a map."""
 
     graph: PoseGraph
     recognition: Recognition
-    places: Sequence[Place]  # those of the graph, and possibly one more
-    body_T_camera: Sequence[Float]  # (4, 4) of the first camera, as it was calibrated when each place was seen
+    places: Sequence[Place]  # the places of the graph, and possibly one more
+    body_T_camera: Sequence[Float]  # (4, 4) pose of the first camera, with the calibration in force at each place
 
 
 def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     """Write a map atomically; an older map is replaced, other files in the folder stay."""
     check_target(folder)
-    folder = folder.resolve()  # what is replaced is a folder, not a link to it
+    folder = folder.resolve()  # a folder is replaced, not a link to it
     with writing(folder, MapError, "choose another place, or make room"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -77,12 +78,12 @@ def load(folder: Path, rig: Rig, config: Config) -> SavedMap:
     """Read a map.
 
     Args:
-        folder: that a map was saved in.
-        rig: of the session that is to be located in it.
-        config: of places and closures.
+        folder: Folder that a map was saved in.
+        rig: Rig of the session that is to be located in it.
+        config: Configuration with the settings of places and closures.
 
     Raises:
-        MapError: If the folder contains no map, one of another version or rig, or a damaged one.
+        MapError: If the folder contains no map, a map of another version or rig, or a damaged one.
     """
     header = _header(folder)
     try:
@@ -112,7 +113,7 @@ def check_target(folder: Path) -> None:
 
 
 def _columns(kept: SavedMap) -> dict[str, Any]:
-    """Return the columns of ``map.npz`` for N places in F fragments, M images of them, and L closures."""
+    """Return the columns of ``map.npz`` for N places in F fragments, with M images, and L closures."""
     graph, recognition, chains, n = kept.graph, kept.recognition, kept.graph.chains, len(kept.graph)
     pairs = [recognition.pairs(place) for place in range(n)]
     vectors = [np.zeros((0, recognition.words.size)), *(recognition.vectors(place) for place in range(n))]
@@ -125,8 +126,8 @@ def _columns(kept: SavedMap) -> dict[str, Any]:
         "covariance": np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
         "starts": np.array(chains.first_places, dtype=np.int64),  # (F,) first place of each fragment
         "component": np.array(graph.component, dtype=np.int64),  # (F,)
-        "firsts": np.array([chains.poses[place] for place in chains.first_places]).reshape(-1, 4, 4),  # in odom
-        # from the previous place
+        "firsts": np.array([chains.poses[place] for place in chains.first_places]).reshape(-1, 4, 4),  # ``odom_T_body``
+        # from the previous place to each place
         "motions": np.array(chains.motions).reshape(-1, 4, 4),
         "motion_covariances": np.array(chains.covariances).reshape(-1, 6, 6),
         "words": recognition.words,
@@ -166,7 +167,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     columns = _columns(kept)
     np.savez(folder / _PLACES, **columns)
     (folder / _CLOSURES).write_bytes(closures_to_bytes([each.closure for each in kept.graph.closures]))
-    save_rig(rig.with_cameras(lambda camera: replace(camera, mask=None)), folder / _RIG)  # refers to no other files
+    save_rig(rig.with_cameras(lambda camera: replace(camera, mask=None)), folder / _RIG)  # masks are other files
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -180,7 +181,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
 
 
 def _move_others(folder: Path, into: Path) -> None:
-    """Move the files that do not belong to a map."""
+    """Move the files that do not belong to a map into another folder."""
     for path in folder.iterdir():
         if path.name not in _OWN:
             try:
@@ -214,7 +215,7 @@ def _digest(path: Path) -> str:
 
 
 def _difference(rig: Rig, other: Rig) -> str:
-    """Describe how the cameras of two rigs differ, IMU and masks aside; empty if they do not."""
+    """Describe how the cameras of two rigs differ, empty if they do not; IMU and masks are not compared."""
     names, others = [each.name for each in rig.cameras], [each.name for each in other.cameras]
     if names != others:
         return f"cameras {', '.join(names)} here, {', '.join(others)} there"

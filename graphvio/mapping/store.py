@@ -1,4 +1,4 @@
-"""Features and images of the places, on disk."""
+"""Storage of the places' features and images on disk."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from graphvio.rig import Rig
 
 DATABASE = "features.db"
 _IMAGES = "images"
-_MIN_FREE_BYTES = 20_000_000  # for a place: COLMAP aborts the process when the disk is full
+_MIN_FREE_BYTES = 20_000_000  # free space required to store a place: COLMAP aborts the process when the disk is full
 
 
 class PlaceStore:
     """COLMAP's database of the places' features, and the images of the places that were added in this session.
 
     Args:
-        folder: For the database and the images.
-        rig: Cameras of the images.
+        folder: Folder for the database and the images.
+        rig: The rig with the cameras of the images.
 
     Attributes:
-        rig: The rig with which stored places are seen; cameras keep their names.
+        rig: The rig whose calibration is used for stored places; may be replaced by one with the same camera names.
 
     Raises:
         OptimizationError: If the database cannot be opened.
@@ -67,12 +67,12 @@ class PlaceStore:
         return StoredView(self.rig, session, stamp_ns, self._database, self._lock, frameset_at)
 
     def descriptors(self, session: str, stamp_ns: int, j: int) -> AnyArray:
-        """Return the descriptors (K, 128), uint8, of the left image, or the single one, of group j at a place."""
+        """Return the descriptors (K, 128), uint8, of the left or only image of the rig's group j at a place."""
         with self._lock:
             return self._database.descriptors(self.name(session, stamp_ns, j))
 
     def name(self, session: str, stamp_ns: int, j: int) -> str:
-        """Return the name of the left image, or the single one, of group j at a place."""
+        """Return the name of the left or only image of the rig's group j at a place."""
         return image_name(session, self.rig.groups[j].left.name, stamp_ns)
 
     def copy_to(self, folder: Path) -> None:
@@ -87,7 +87,7 @@ class PlaceStore:
 
 
 def copy_database(source: Path, target: Path) -> None:
-    """Copy a database that may be open: its file alone may lack the last changes."""
+    """Copy a database that may be open, by SQLite's backup: the file alone may lack the last changes."""
     try:
         with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as other:
             one.backup(other)

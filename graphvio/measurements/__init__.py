@@ -1,1 +1,1 @@
-"""What stages hand each other: measurements, motions, gate results, estimates and events."""
+"""Data types that the stages exchange: measurements, motions, gate results, estimates and events."""

@@ -1,4 +1,4 @@
-"""The state of the rig as the odometry estimates it, and as it is predicted from there."""
+"""Estimates of the rig's state by the odometry, and predictions from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphvio.measurements.motion import PairReport, Quality
 
 
 class Status(StrEnum):
-    """What an estimate is based on."""
+    """Status of an estimate: what it is based on."""
 
     INITIALISING = "initialising"
     """There is no pose yet, or vision constrains it while attitude or velocity are not known well."""
@@ -31,18 +31,18 @@ class Estimate:
     Attributes:
         stamp_ns: Stamp of the frameset.
         status: What the pose is based on.
-        nav_T_body: (4, 4) pose, or None while initialising without a state and while lost. Its position goes on from
-            frameset to frameset within an epoch; its attitude turns where that of the cameras in body is corrected.
-        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose. Where
-            the calibration is estimated it contains what errors of the cameras add.
+        nav_T_body: (4, 4) pose, or None while initialising without a state and while lost. Within an epoch its position
+            is continuous; its attitude changes at once where that of the cameras in body is corrected.
+        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None without a pose. Where
+            the calibration is estimated, the effect of the cameras' errors is included.
         epoch: Number of declared breaks; poses of different epochs do not share a nav frame.
         velocity_nav: (3,) m/s in nav, or None when not estimated.
         gyro_bias: (3,) rad/s, or None without an IMU.
         accel_bias: (3,) m/s^2, or None without an IMU.
         velocity_covariance: (3, 3) of ``velocity_nav``, in nav, or None where it is not estimated.
         gravity_nav: (3,) m/s^2 in nav, downwards, or None without an IMU. Its direction at the beginning of an epoch is
-            uncertain and becomes known later; poses are not turned then, so that nav may be off the level by what
-            ``gravity_nav`` says.
+            uncertain and becomes known later; poses are not turned then, so that nav may be tilted, as
+            ``gravity_nav`` shows.
         gravity_covariance: (3, 3) of ``gravity_nav``, in nav, or None without an IMU.
         tilt_covariance: (2, 2) of roll and pitch against gravity, rad^2, about the horizontal axes of nav turned level;
             None without an IMU.
@@ -53,7 +53,7 @@ class Estimate:
         innovations: Outcomes of the innovation tests by name: ``vision``, and ``zero_velocity`` at a standstill; with
             the paper's filter ``vision``, ``gyro`` and ``accelerometer``.
         rates: Angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
-        vision: How far the motion that vision measured can be trusted.
+        vision: Quality of the motion that vision measured.
         vision_reason: Why that is not ``good``, or empty.
         vision_sigmas: Standard deviations of that motion in the directions that are known least, of the rotation
             (radians) and the translation (metres); None without a motion.
@@ -93,10 +93,10 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """The predicted rig between framesets or beyond the newest one.
+    """The predicted state of the rig between framesets or beyond the newest one.
 
     Attributes:
-        stamp_ns: On the framesets' clock.
+        stamp_ns: Instant on the framesets' clock.
         nav_T_body: (4, 4) pose.
         velocity_nav: (3,) m/s in nav.
         angular_velocity: (3,) rad/s in body, without the gyro's bias.

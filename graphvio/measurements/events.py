@@ -1,4 +1,4 @@
-"""Events of a run that a person would want to know of, and their kinds."""
+"""Events of a run, such as rejected measurements, resets and faults of the input, and their kinds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 CORRECTED = "corrected for this run"
-"""Ends sentences about errors of the rig file that the run's results, ``rig-refined.yaml`` among them, do not have."""
+"""Suffix of sentences about errors of the rig file that are corrected in the run's results and ``rig-refined.yaml``."""
 
 
 class EventKind(StrEnum):
@@ -19,19 +19,19 @@ class EventKind(StrEnum):
     IMU_OUT_OF_RANGE = "imu_out_of_range"
     """An IMU sample is beyond what any inertial sensor measures; it is left out."""
     IMU_DUPLICATE_STAMP = "imu_duplicate_stamp"
-    """An IMU sample has the stamp of the one before; it is left out."""
+    """An IMU sample has the stamp of the previous one; it is left out."""
     IMU_BACKWARD_STAMP = "imu_backward_stamp"
-    """An IMU sample is older than the one before; it is left out."""
+    """An IMU sample is older than the previous one; it is left out."""
     IMU_FUTURE_STAMP = "imu_future_stamp"
     """The stamp of an IMU sample is far ahead of its neighbours'; it is left out."""
     IMU_STUCK = "imu_stuck"
     """An axis of the IMU repeats its value beyond what noise allows; samples are left out until it changes again."""
     IMU_SPIKE = "imu_spike"
-    """A single IMU sample is far from the ones before and after it; it is left out."""
+    """A single IMU sample is far from its neighbours; it is left out."""
     FRAMESET_DUPLICATE_STAMP = "frameset_duplicate_stamp"
-    """A frameset comes less than 1 ms after the one before; it is left out."""
+    """A frameset comes less than 1 ms after the previous one; it is left out."""
     FRAMESET_BACKWARD_STAMP = "frameset_backward_stamp"
-    """A frameset is older than the one before; it is left out."""
+    """A frameset is older than the previous one; it is left out."""
     FRAMESET_FUTURE_STAMP = "frameset_future_stamp"
     """The stamp of a frameset is far ahead of its neighbours'; it is left out."""
     UNKNOWN_PAIR = "unknown_pair"
@@ -39,15 +39,15 @@ class EventKind(StrEnum):
     IMU_NOT_COVERING = "imu_not_covering"
     """No IMU samples cover the interval between two framesets; the motion is predicted without them."""
     IMU_LEFT_OUT = "imu_left_out"
-    """The IMU contradicts vision of good quality for long; it is left out until it moves as they do."""
+    """The IMU contradicts good vision for long; it is left out until its motion agrees with vision again."""
     IMU_USED_AGAIN = "imu_used_again"
-    """An IMU that was left out moves as the cameras do; it is used again."""
+    """The motion of an IMU that was left out agrees with vision again; the IMU is used again."""
     IMU_CLOCK_OFF = "imu_clock_off"
-    """The IMU moves as the cameras do, but earlier or later by its stamps; its clock is corrected where that can be."""
+    """The IMU's motion agrees with vision, but its stamps are early or late; they are corrected if possible."""
     STARTED_WITHOUT_IMU = "started_without_imu"
-    """No IMU samples came while the odometry waited for them; it is initialised without."""
+    """No IMU samples came while the odometry waited for them; it is initialised without the IMU."""
     IMU_CAME = "imu_came"
-    """IMU samples came after a start without them. The path goes on; of the paper's filter, a new epoch begins."""
+    """IMU samples came after a start without them. The trajectory continues; the paper's filter begins a new epoch."""
 
     # ---------------------------------------------------------------- vision
     VISION_FAILED = "vision_failed"
@@ -57,38 +57,36 @@ class EventKind(StrEnum):
     CAMERA_FROZEN = "camera_frozen"
     """A camera repeats its image while others do not; its pair is left out until the image changes."""
     PAIR_UNUSED = "pair_unused"
-    """A stereo pair takes part in no motion for 5 s, while other cameras do; check its images and its calibration."""
+    """A stereo pair contributes to no motion for 5 s, while other cameras do; check its images and its calibration."""
     RIG_MISTAKEN = "rig_mistaken"
     """A pair's images match only if left and right are exchanged, or if its cameras' transforms are inverted."""
     CALIBRATION_CORRECTED = "calibration_corrected"
     """A part of the rig file is wrong beyond 5 sigma by two windows of keyframes; it is corrected from now on."""
     CALIBRATION_CHANGED = "calibration_changed"
-    """For some time the images contradict the calibration that was known, as after a knock; it is estimated again."""
+    """The images contradict the estimated calibration for some time, as after a knock; it is estimated again."""
     CALIBRATION_REFUSED = "calibration_refused"
-    """Two windows of keyframes ask for a calibration that is farther from the rig file than any file is wrong, and do
-    not agree on it, or it is the IMU's. It is not used, and poses are worse than their covariance says: calibrate
-    again."""
+    """Two windows of keyframes each imply an implausibly large error of the rig file, and disagree on it, or the error
+    is one of the IMU. It is not corrected, and poses are worse than their covariance: calibrate again."""
     EXTRINSICS_OFF = "extrinsics_off"
     """The pairs' motions contradict the rig's transform between them; it is corrected for this run. Or the scale of
-    single cameras' overlapping views contradicts the accelerometer's; overlaps are not used from then on."""
+    single cameras' overlapping views contradicts the accelerometer; overlaps are not used from then on."""
 
     # ---------------------------------------------------------------- state estimation
     VISION_GATED = "vision_gated"
-    """A measured motion failed the innovation test, or asks for an impossible acceleration; it is left out."""
+    """A measured motion failed the innovation test, or implies an impossible acceleration; it is left out."""
     GYRO_GATED = "gyro_gated"
     """The mean angular rate failed the paper's filter's innovation test; it is left out."""
     ACCELEROMETER_GATED = "accelerometer_gated"
     """The mean specific force failed the paper's filter's innovation test; it is left out."""
     ZERO_VELOCITY_GATED = "zero_velocity_gated"
-    """Images and IMU show a standstill, but the state is sure of a motion; the zero-velocity update is left out."""
+    """Images and IMU show a standstill, but the state is certain of a motion; the zero-velocity update is left out."""
     MOTION_OVER_SEVERAL_STEPS = "motion_over_several_steps"
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
-    """The gate rejected vision for too long; the smoother is reinitialised from vision, the filter's velocities are
-    reset. Or the IMU's calibration turns out to be wrong while vision is rejected, or good images are rejected after a
-    gap that the IMU alone has bridged: the smoother is reinitialised from vision. Or the frameset that motions are
-    measured from was rejected, and the next motion passes: the smoother goes on from the prediction, uncertain by what
-    vision said."""
+    """The gate rejected vision for too long: the smoother is reinitialised from vision, the filter's velocities are
+    reset. Or the IMU's calibration proves wrong while vision is rejected, or good images are rejected after a gap that
+    the IMU alone has bridged: the smoother is reinitialised from vision. Or the motion to the keyframe was rejected,
+    and the next motion passes: the smoother is reinitialised at the prediction, with the difference as uncertainty."""
     SCALE_KNOWN = "scale_known"
     """A rig of single cameras has moved so that the scale is known; poses are estimated from now on."""
     LOST = "lost"
@@ -113,9 +111,9 @@ class EventKind(StrEnum):
 
     # ---------------------------------------------------------------- recordings
     SESSION_CUT = "session_cut"
-    """The recording of a session was not finished; what there is is read."""
+    """The recording of a session was not finished; its readable part is used."""
     SESSION_DAMAGED = "session_damaged"
-    """Parts of a session cannot be read; what is left is read."""
+    """Parts of a session cannot be read; the other parts are used."""
     IMU_GARBAGE = "imu_garbage"
     """A row or message of the IMU is not valid; it is dropped."""
     IMU_UNITS = "imu_units"
@@ -210,11 +208,11 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a person would want to know of: a measurement that was rejected, a reset, a fault of the input.
+    """An event of a run: a measurement that was rejected, a reset, or a fault of the input.
 
     Attributes:
-        stamp_ns: When, on the clock of the data concerned.
-        kind: What happened. Drivers of devices may have kinds of their own.
+        stamp_ns: Time of the event, on the clock of the data concerned.
+        kind: Kind of the event, see `EventKind`. Drivers of devices may have kinds of their own.
         detail: One line for people, with the figures.
     """
 
@@ -224,4 +222,4 @@ class Event:
 
 
 Report = Callable[[int, str, str], None]
-"""Takes stamp, kind and detail of an event."""
+"""Function that takes stamp, kind and detail of an event."""

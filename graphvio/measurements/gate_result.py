@@ -18,7 +18,7 @@ class GateResult:
         statistic: Squared Mahalanobis distance of the innovation.
         threshold: Largest statistic that passes.
         innovation: (M,) measurement less its prediction.
-        covariance: (M, M) of the innovation.
+        covariance: (M, M) covariance of the innovation.
     """
 
     accepted: bool
@@ -34,5 +34,5 @@ class GateResult:
 
     @property
     def exceedance(self) -> str:
-        """Why the measurement was refused, for the detail of an event."""
+        """Reason why the measurement was refused, for the detail of an event."""
         return f"innovation {self.statistic:.1f} beyond chi-square {self.threshold:.1f}"

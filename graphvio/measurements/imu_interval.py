@@ -11,15 +11,15 @@ from graphvio.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
-    """The IMU between two instants, as steps of constant rate and specific force.
+    """IMU readings between two instants, as steps of constant rate and specific force.
 
     Attributes:
         steps_s: (N,) durations of the steps.
         angular_velocity: (N, 3) rad/s, body.
         linear_acceleration: (N, 3) m/s^2 specific force, body.
-        noise_densities: (2,) of gyro and accelerometer, as the samples show them (`graphvio.measurements.imu_noise`);
-            zero where that is not known.
-        stamp_sigma_s: standard deviation of both instants, as of framesets that are stamped when they arrive.
+        noise_densities: (2,) of gyro and accelerometer, estimated from the samples (`graphvio.measurements.imu_noise`);
+            zero where they are not known.
+        stamp_sigma_s: standard deviation of the stamps of both instants, as of framesets that are stamped on arrival.
     """
 
     steps_s: Float

@@ -1,4 +1,4 @@
-"""How the rig moved at a keyframe, as a bundle adjustment with the calibration as unknowns finds it."""
+"""Velocity, biases and gravity at a keyframe, from a bundle adjustment that also estimates the calibration."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class InertialState:
     """Velocity, biases and gravity at a keyframe, in the body frame then.
 
     Attributes:
-        stamp_ns: of the frameset.
+        stamp_ns: stamp of the frameset.
         velocity: (3,) m/s.
-        accel_bias: (3,) m/s^2, of what the readings are corrected to.
-        gyro_bias: (3,) rad/s, likewise.
+        accel_bias: (3,) bias of the readings after their correction by the calibration, m/s^2.
+        gyro_bias: (3,) bias of the corrected readings, rad/s.
         gravity: (3,) m/s^2, downwards.
-        covariance: (12, 12) of ``[velocity, accel_bias, gyro_bias, gravity]``.
+        covariance: (12, 12) covariance of ``[velocity, accel_bias, gyro_bias, gravity]``.
     """
 
     stamp_ns: int
@@ -30,7 +30,7 @@ class InertialState:
     covariance: Float
 
     def distance2(self, velocity: Float, accel_bias: Float, gyro_bias: Float, gravity: Float) -> float:
-        """Return the squared Mahalanobis distance of other values, by this covariance alone."""
+        """Return the squared Mahalanobis distance of other values from these, by the covariance of these alone."""
         off = np.concatenate(
             [velocity - self.velocity, accel_bias - self.accel_bias, gyro_bias - self.gyro_bias, gravity - self.gravity]
         )
@@ -38,5 +38,5 @@ class InertialState:
 
     @property
     def tilt_sigma_rad(self) -> float:
-        """Standard deviation of gravity's direction, in the direction in which it is known least."""
+        """Largest standard deviation of gravity's direction, rad."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[9:, 9:])[-1]) / np.linalg.norm(self.gravity))

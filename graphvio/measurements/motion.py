@@ -14,26 +14,26 @@ from graphvio.arrays import Float, Int
 
 
 class Quality(StrEnum):
-    """How far a measured motion can be trusted."""
+    """Quality of a measured motion: how far it can be trusted."""
 
     GOOD = "good"
     """Its covariance is consistent."""
     WEAK = "weak"
-    """Something speaks against it, as its reason says; its covariance is enlarged."""
+    """It is doubtful, for the reason that is given; its covariance is enlarged."""
     FAILED = "failed"
     """There is no motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairReport:
-    """What one stereo pair contributed to a frameset.
+    """The contribution of one stereo pair to a frameset's motion.
 
     Attributes:
         points: Points that take part in the estimation.
         inliers: Points that the chosen motion explains.
         pixels: (N, 2) left-image pixels of the tracked corners, for display.
-        is_inlier: (N,) whether each of them is an inlier.
-        ages: (N,) number of earlier frames that saw each of them.
+        is_inlier: (N,) whether each of these corners is an inlier.
+        ages: (N,) number of earlier frames that saw each of these corners.
         rejected: Check of tracking or stereo matching -> number of corners that failed it.
         rms_px: RMS reprojection error of the inliers under the chosen motion, per direction and without the share of
             the points' own uncertainty; None where there are none.
@@ -54,13 +54,13 @@ class PairReport:
 
 
 class ByVelocities(NamedTuple):
-    """How a motion that rolling shutters measure depends on the velocities by which their lines were compensated.
+    """Dependence of a motion by rolling shutters on the velocities with which their lines were compensated.
 
     Attributes:
-        used: (2, 3) m/s, of body at the later instant and at the earlier one, in body there.
-        derivatives: (2, 6, 3) of the motion as it is measured with these, with respect to the true velocities, tangent
-            ``[rotation, translation]`` in the body frame of the later instant.
-        covariances: (2, 3, 3) of the velocities that were used.
+        used: (2, 3) velocities that were used: of body at the later and at the earlier instant, in body there, m/s.
+        derivatives: (2, 6, 3) derivatives of the motion that is measured with these, with respect to the true
+            velocities, tangent ``[rotation, translation]`` in the body frame of the later instant.
+        covariances: (2, 3, 3) covariances of the velocities that were used.
     """
 
     used: Float
@@ -75,19 +75,20 @@ class RelativeMotion:
     Attributes:
         reference_stamp_ns: Stamp of the earlier frameset.
         stamp_ns: Stamp of the later frameset.
-        reference_T_current: (4, 4) of body: the motion that a between factor takes.
+        reference_T_current: (4, 4) motion of body, as a between factor takes it.
         covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame of the later instant.
         shared_covariance: (6, 6) the part of it that all motions from this reference have in common, same tangent.
-        inliers: Number of points that it explains.
-        by_depth_errors: (P, 2, 6) derivatives with respect to an offset of all inverse depths of a pair, 1/m, and to a
-            share of them, in the opposite direction of the same tangent: what the reference does, seen from body now.
-            Zero for pairs that did not measure it, None where errors of pairs are not estimated.
-        calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
-            where they add nothing. Innovation tests allow for it.
-        by_velocities: Of rolling shutters, for those who estimate the velocities. The covariance does not allow for
-            errors of these; that of `with_any_velocity` does.
-        pairs: Indices of the pairs and single cameras whose motion it is, of one of several hypotheses and of a partial
-            motion.
+        inliers: Number of points that the motion explains.
+        by_depth_errors: (P, 2, 6) derivatives with respect to two errors of each pair's inverse depths: an offset of
+            all, 1/m, and a relative error. They are in the opposite direction of the same tangent: that of the
+            reference's motion, seen from body at the later instant. Zero for pairs that did not measure the motion,
+            None where errors of pairs are not estimated.
+        calibration_covariance: (6, 6) covariance that errors of the calibration add to the motion's innovation, same
+            tangent, or None where they add nothing. Innovation tests allow for it.
+        by_velocities: Dependence on velocities of a motion by rolling shutters, for estimators of these velocities, or
+            None. The covariance does not include errors of the velocities; that of `with_any_velocity` does.
+        pairs: Indices of the pairs and single cameras that measured the motion; only for one of several hypotheses and
+            for a partial motion.
     """
 
     reference_stamp_ns: int
@@ -102,7 +103,7 @@ class RelativeMotion:
     pairs: tuple[int, ...] = ()
 
     def with_any_velocity(self) -> RelativeMotion:
-        """Return the motion with a covariance that allows for errors of the velocities that rolling shutters need."""
+        """Return the motion with a covariance that includes errors of the velocities in ``by_velocities``."""
         if self.by_velocities is None:
             return self
         _, derivatives, covariances = self.by_velocities
@@ -124,11 +125,11 @@ class RelativeMotion:
 
 
 class CrossCameraMatches(NamedTuple):
-    """Where another camera sees tracks of a single camera at the same instant.
+    """Matches of a single camera's tracks in another camera at the same instant.
 
     Attributes:
         camera: index of the other camera.
-        rows: (M,) of the tracks.
+        rows: (M,) rows of the tracks in `CameraTracks`.
         rays: (M, 2) normalised coordinates in the other camera.
     """
 
@@ -138,12 +139,12 @@ class CrossCameraMatches(NamedTuple):
 
 
 class HandedOverTracks(NamedTuple):
-    """Tracks of a single camera that follow points which another camera's tracks began.
+    """Tracks of a single camera that continue tracks of other cameras.
 
     Attributes:
-        rows: (M,) of the tracks.
-        cameras: (M,) index of the camera whose track began.
-        ids: (M,) identity of that track.
+        rows: (M,) rows of the tracks in `CameraTracks`.
+        cameras: (M,) index of the camera in which the point was tracked first.
+        ids: (M,) identity of the track in that camera.
     """
 
     rows: Int
@@ -156,16 +157,17 @@ _NONE_HANDED_OVER = HandedOverTracks(*(np.zeros(0, dtype=np.int64) for _ in rang
 
 
 class CameraTracks(NamedTuple):
-    """What one single camera sees at an instant.
+    """The tracks of one single camera at an instant.
 
     Attributes:
         ids: (N,) identities of its tracks, increasing.
-        rays: (N, 2) normalised coordinates; those of a rolling shutter are as if it had not turned since the stamp.
+        rays: (N, 2) normalised coordinates; those of a rolling shutter are corrected for its rotation since the stamp.
         matches: the same tracks in other cameras whose views overlap.
-        handed_over: which of them follow points of other cameras' tracks.
-        readout: (N, 4) of a rolling shutter, when and from where a line sees: ``[seconds, x, y, z]`` from the stamp to
-            the line's exposure, and the camera's way until then in metres, frame body at the stamp, by turn and
-            specific force: without what velocity and gravity add. (0, 4) of a global shutter.
+        handed_over: those of the tracks that continue tracks of other cameras.
+        readout: (N, 4) exposure of each track's line, for a rolling shutter: ``[seconds, x, y, z]``, the time from the
+            stamp to the exposure, and the camera's displacement until then, metres, in body at the stamp. It includes
+            the effect of rotation and specific force, but not that of velocity and gravity. (0, 4) for a global
+            shutter.
     """
 
     ids: Int
@@ -176,12 +178,12 @@ class CameraTracks(NamedTuple):
 
 
 class LocatedPoints(NamedTuple):
-    """Points that one single camera sees at an instant, and where they are.
+    """Points of known position that one single camera sees at an instant.
 
     Attributes:
         ids: (N,) identities of its tracks, increasing.
-        points_body: (N, 3) metres, in body.
-        covariances: (N, 3, 3) m^2 of these.
+        points_body: (N, 3) positions in body, metres.
+        covariances: (N, 3, 3) covariances of the positions, m^2.
     """
 
     ids: Int
@@ -196,15 +198,15 @@ class VisualResult:
     Attributes:
         motion: The measured motion, or None.
         quality: How far the motion can be trusted.
-        reason: Why it is not good, or empty.
+        reason: Reason why the motion is not good, or empty.
         pairs: Pair index -> report of the pair.
         alternatives: Motion hypotheses with their own covariances, where pairs contradict each other.
-        partial_motion: Where too few points are in view for a motion, the predicted one as they correct it, if an IMU
-            predicts it; its covariance is of what they show, and large in directions that they do not show.
-        own: At the end of a keyframe, pair index -> its own motion of body by the rig's extrinsics.
+        partial_motion: Where too few points are in view for a motion, the motion that an IMU predicts, corrected by
+            these points; its covariance is that of the correction, and large in directions that they do not determine.
+        own: At the end of a keyframe, pair index -> motion of body by this pair alone, with the rig's extrinsics.
         is_stationary: Whether the images have shown no motion for a while.
         frozen: Pairs that were left out because a camera of theirs repeats an image.
-        camera_tracks: Of a rig without pairs, camera index -> its tracks; the back-end then measures the motion.
+        camera_tracks: For a rig without pairs, camera index -> its tracks, from which the back-end measures the motion.
         stage_ms: Processing time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
             ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``quality``, and
             ``replenish``, which is next to nothing unless the reference changes.

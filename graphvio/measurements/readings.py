@@ -1,4 +1,4 @@
-"""What devices deliver: IMU readings, camera frames and notices, stamped by their own clocks, and the host's clock."""
+"""Data that devices deliver, with stamps of their own clocks: IMU readings, camera frames and notices."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 
 
 def host_ns() -> int:
-    """Return the host's time: nanoseconds since 1970, steady from the start of the process on."""
+    """Return the host's time, nanoseconds since 1970; it is monotonic within the process."""
     return _EPOCH_NS + time.monotonic_ns()
 
 
@@ -21,13 +21,13 @@ class ImuReading:
     """An IMU sample as it arrives.
 
     Attributes:
-        stamp_ns: on ``clock``.
+        stamp_ns: stamp on ``clock``.
         angular_velocity: (3,) rad/s, frame body.
         linear_acceleration: (3,) m/s^2, frame body.
         arrival_ns: host time of its arrival, see `host_ns`.
         clock: name of the clock that stamped it, such as a device's serial number; None where stamps are kept as they
             are, all sensors sharing one clock.
-        temperature_c: of the sensor, or None.
+        temperature_c: temperature of the sensor, or None.
     """
 
     stamp_ns: int
@@ -43,12 +43,12 @@ class CameraFrame:
     """An image as it arrives.
 
     Attributes:
-        camera: its name in the rig.
-        stamp_ns: on ``clock``, of the middle of the exposure where the device reports it.
-        decode: makes the grey image (height, width) uint8, in another thread; raises `graphvio.SourceError` if the
-            data are damaged.
+        camera: name of the camera in the rig.
+        stamp_ns: stamp on ``clock``, of the middle of the exposure where the device reports it.
+        decode: returns the grey image (height, width) uint8, and is called in another thread; raises
+            `graphvio.SourceError` if the data are damaged.
         arrival_ns: host time of its arrival, see `host_ns`.
-        clock: as for `ImuReading`.
+        clock: as in `ImuReading`.
     """
 
     camera: str
@@ -66,7 +66,7 @@ class Notice:
         kind: short name that can be counted: ``device_lost``, ``device_back``, or a fault of the driver.
         detail: one line for people.
         arrival_ns: host time, see `host_ns`.
-        clock: of the device, whose clock may have restarted, or None.
+        clock: name of the device's clock if it may have restarted, or None.
     """
 
     kind: str
@@ -83,10 +83,10 @@ class DeviceHealth:
     """The state of a device.
 
     Attributes:
-        name: of the device.
-        connected: whether it delivers, or could.
+        name: name of the device.
+        connected: whether the device delivers data, or could.
         detail: one line for people: model, firmware, what is wrong.
-        counts: losses in the driver, by kind.
+        counts: number of losses in the driver, by kind.
     """
 
     name: str

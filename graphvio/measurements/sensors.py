@@ -17,8 +17,8 @@ from graphvio.errors import MeasurementError
 from graphvio.rig import Imu
 
 GRAVITY_M_S2 = 9.81
-"""What gravity measures; its direction is estimated."""
-_LARGEST_STAMP = 2**62  # differences of two stamps are int64, too
+"""Magnitude of gravity, taken as known; its direction is estimated."""
+_LARGEST_STAMP = 2**62  # so that the difference of two stamps is an int64, too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +97,7 @@ def checked_measurement(measurement: Measurement) -> Measurement:
                 f"IMU sample at {stamp_ns}: both vectors must have three components, and all be numbers"
             )
         return ImuSample(stamp_ns, *vectors)
-    pairs: object = measurement.images  # what callers without a type checker give
+    pairs: object = measurement.images  # callers without a type checker may pass anything
     if not isinstance(pairs, Mapping):
         raise MeasurementError(
             f"frameset at {stamp_ns}: images is a {type(pairs).__name__}; map pairs to (left, right)"

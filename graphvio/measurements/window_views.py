@@ -1,4 +1,4 @@
-"""What views of landmarks say of the poses from which they were seen, once the landmarks are eliminated."""
+"""Information of landmark views on the poses from which they were seen, after elimination of the landmarks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 
-_MIN_INFORMATION = 1e-6  # of a pose that is eliminated: next to nothing, it keeps its block invertible
+_MIN_INFORMATION = 1e-6  # added to that of an eliminated pose: negligible, but keeps its block invertible
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,11 +16,11 @@ class WindowViews:
     """Views of landmarks from K states, as a quadratic cost of the states' poses.
 
     The cost is ``gradient . d + d . information d / 2``, for small changes d of the poses. It does not change if all
-    poses move together; where nothing shows the scale, neither with that.
+    poses move together, nor with the scale where no measurement determines it.
 
     Attributes:
-        stamps_ns: (K,) of the states, increasing.
-        poses: (K, 4, 4) ``nav_T_body`` at which it was linearised.
+        stamps_ns: (K,) stamps of the states, increasing.
+        poses: (K, 4, 4) ``nav_T_body`` at which the cost was linearised.
         information: (6 K, 6 K), tangents ``[rotation, translation]`` on the right, in body at each.
         gradient: (6 K,) at these poses.
     """
@@ -31,7 +31,7 @@ class WindowViews:
     gradient: Float
 
     def of(self, kept: Bool) -> WindowViews:
-        """Return what they say of some of the states (K,), whatever the poses of the others may be."""
+        """Return the cost of the states that are kept (K,), after elimination of the poses of the others."""
         rows = np.repeat(kept, 6)
         if rows.all():
             return self
@@ -48,16 +48,16 @@ class WindowViews:
 
 @dataclass(frozen=True, eq=False)
 class FirstWindow:
-    """What is known of the first states of an epoch from before its first pose, as a quadratic cost.
+    """Information on the first states of an epoch from before its first pose, as a quadratic cost.
 
     Attributes:
-        stamps_ns: (K,) of the states, increasing.
-        poses: (K, 4, 4) ``nav_T_body`` at which it was linearised.
-        velocity: (3,) m/s, of the first state in nav.
-        gravity: (3,) m/s^2, in nav.
-        biases: (6,) of gyro, rad/s, and accelerometer, m/s^2.
+        stamps_ns: (K,) stamps of the states, increasing.
+        poses: (K, 4, 4) ``nav_T_body`` at which the cost was linearised.
+        velocity: (3,) velocity of the first state in nav, m/s.
+        gravity: (3,) gravity in nav, m/s^2.
+        biases: (6,) biases of gyro, rad/s, and accelerometer, m/s^2.
         information: (6 K + 12, 6 K + 12) of poses, velocity, gravity and biases.
-        gradient: (6 K + 12,).
+        gradient: (6 K + 12,) at these values.
     """
 
     stamps_ns: Int

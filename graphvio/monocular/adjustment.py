@@ -1,4 +1,4 @@
-"""Adjustment of a window's states: reprojection errors, the IMU between states, and what left the window before."""
+"""Nonlinear least squares of a window's states: reprojection errors, the IMU between states, and the window's prior."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from graphvio.monocular.window_prior import Prior, add_prior
 from graphvio.self_calibration.evidence import Evidence, Gaussian
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
 
-ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
-_CONVERGED = 1e-3  # of an adjustment that is used once: see `adjust`
+ROBUST_SCALE = 2.5  # scale of the Cauchy cost, in standard deviations
+_CONVERGED = 1e-3  # see `adjust`: for windows that no later frameset improves
 _DAMPING = 1e-8  # at first, as a share of the diagonal; with more, a step does not go all the way to the solution
 _GRAVITY_NORM_SIGMA = 0.02
 ZERO_VELOCITY_SIGMA = 0.01
@@ -35,12 +35,12 @@ class Measurements(NamedTuple):
     """Measurements of a window.
 
     Attributes:
-        cameras: of the rig file.
+        cameras: cameras of the rig file.
         structure: views of landmarks.
         sigma_px: noise of a corner's position.
-        samples: of the IMU, whose keyframes are the states.
-        stationary: (K,) of states, which do not move.
-        depth_information: of a landmark's prior inverse depth, m^2.
+        samples: IMU samples, whose keyframes are the states.
+        stationary: (S,) indices of the states at which the rig does not move.
+        depth_information: information of a landmark's prior inverse depth, m^2.
     """
 
     cameras: Cameras
@@ -63,13 +63,13 @@ class Equations(NamedTuple):
 
 
 class Adjusted(NamedTuple):
-    """The outcome of an adjustment.
+    """Result of an adjustment.
 
     Attributes:
-        states: adjusted.
-        landmarks: (L, 3).
+        states: adjusted states.
+        landmarks: (L, 3) adjusted landmarks.
         measured: what was adjusted, with the frames that the landmarks are in now.
-        equations: at these.
+        equations: normal equations at these states and landmarks.
     """
 
     states: States
@@ -84,12 +84,12 @@ def equations(
     """Linearise all errors of a window.
 
     Args:
-        measured: in the window.
-        states: K of them.
+        measured: measurements of the window.
+        states: K states.
         landmarks: (L, 3).
-        prior: from before the window.
-        file: what the rig file, and epochs before, say of the calibration, which is unknown then; None where the
-            calibration is taken for known.
+        prior: prior of states from before the window, or None.
+        file: prior of the calibration by the rig file and epochs before, where it is unknown; None where the
+            calibration is taken as known.
     """
     n, n_free = len(states.poses), 0 if file is None else len(states.calibration)
     n_camera_parameters = states.n_camera_parameters
@@ -140,16 +140,17 @@ def adjust(
     file: Gaussian | None = None,
     converged: float = _CONVERGED,
 ) -> Adjusted:
-    """Minimise all errors of a window by Levenberg and Marquardt.
+    """Minimise all errors of a window by Levenberg-Marquardt.
 
     Args:
-        measured: in the window.
-        states: K of them.
-        landmarks: (L, 3).
-        prior: from before the window.
-        max_steps: that are taken.
-        file: as in `equations`.
-        converged: squared distance, in standard deviations, of all unknowns from the solution, at which steps end.
+        measured: measurements of the window.
+        states: K initial states.
+        landmarks: (L, 3) initial landmarks.
+        prior: prior of states from before the window, or None.
+        max_steps: largest number of steps.
+        file: prior of the calibration, or None, as in `equations`.
+        converged: squared distance of all unknowns from the solution, in standard deviations, below which no step
+            follows.
 
     Raises:
         numpy.linalg.LinAlgError: if the equations have no solution.
@@ -187,12 +188,12 @@ def adjust(
 
 
 def evidence_of(at: Equations, states: States, file: Gaussian) -> Evidence:
-    """Return what a window says of the calibration, from equations for which that is unknown.
+    """Return the evidence of a window about the calibration, from equations in which the calibration is unknown.
 
     Args:
         at: equations at the states.
-        states: adjusted.
-        file: what the rig file, and epochs before, say: it is in the equations, and not in the evidence.
+        states: adjusted states.
+        file: prior by the rig file and epochs before: it is in the equations, and not in the evidence.
     """
     hessian, n_free = at.hessian.copy(), len(file.mean)
     known = len(hessian) - n_free
@@ -209,14 +210,14 @@ def evidence_of(at: Equations, states: States, file: Gaussian) -> Evidence:
 def views_only(
     cameras: Cameras, structure: Structure, sigma_px: float, states: States, landmarks: Float
 ) -> tuple[Float, Float]:
-    """Linearise what views alone say of the poses, for any places of the landmarks.
+    """Return the reprojection errors alone as a quadratic cost of the poses, with the landmarks eliminated.
 
     Args:
-        cameras: with the calibration that is in force.
-        structure: of the views.
+        cameras: cameras, with the calibration that is in force.
+        structure: views of the landmarks.
         sigma_px: noise of a corner's position.
-        states: K of them.
-        landmarks: (L, 3), from which their best places for these poses are found.
+        states: K states.
+        landmarks: (L, 3) initial landmarks; the best ones for these poses are found first.
 
     Returns:
         Information (6 K, 6 K) and gradient (6 K,).
@@ -240,7 +241,7 @@ def covariance_of(hessian: Float, unknowns: Int) -> Float:
     """Return the joint covariance of some unknowns, from the Hessian of all.
 
     Raises:
-        numpy.linalg.LinAlgError: if it is not positive definite.
+        numpy.linalg.LinAlgError: if the Hessian is not positive definite.
     """
     chosen = np.zeros((len(unknowns), len(hessian)))
     chosen[np.arange(len(unknowns)), unknowns] = 1.0

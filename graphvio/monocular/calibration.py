@@ -1,8 +1,9 @@
 """Calibration of single cameras and IMU as unknowns of the window: how wrong the rig file is, and what is known of it.
 
-As long as the measurements say nothing against the rig file, it is taken for exact, and the window is solved without
-these unknowns; what left the window before still knows what it would have said of them. Once it speaks against the
-file, they are solved for with the states, as part of the same window.
+As long as the measurements do not contradict the rig file, it is taken as exact, and the window is solved without these
+unknowns. The prior of states that left the window includes them all the same, so that the evidence of earlier
+measurements about the calibration is kept. Once the evidence contradicts the file, the calibration is estimated
+together with the states of the window.
 """
 
 from __future__ import annotations
@@ -31,34 +32,34 @@ from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OF
 from graphvio.self_calibration.parameters import n_camera_parameters
 from graphvio.self_calibration.prior import file_prior
 
-_MIN_FACTOR = 1.0  # of a file that is not exact: much smaller ones hold parts of it that nothing has shown yet
-_FIRST_FACTORS = (1.0, 3.0)  # which are tried where a first window of an exact file fits no motion
-_MIN_TWICE_LOG_RATIO = 4.0  # by which factors change: each change moves the window's poses
-_FAR_OFF = 3.0  # factor of a file whose scale is not to be trusted
-_MAX_SIGMAS = 4.0  # no file is so wrong: the window is
-_MAX_SIGMAS_UNDER_WAY = 12.0  # by files of level 3, principal points reach seven
-_WALK = 0.01  # in one second, as a share of the file's standard deviations
+_MIN_FACTOR = 1.0  # for a file that is not exact: much smaller ones would fix parameters that nothing has shown yet
+_FIRST_FACTORS = (1.0, 3.0)  # tried where a first window fits no motion with an exact file
+_MIN_TWICE_LOG_RATIO = 4.0  # for another change of the factors, since each one moves the window's poses
+_FAR_OFF = 3.0  # factor of a rig file whose scale is not to be trusted
+_MAX_SIGMAS = 4.0  # no file is more wrong: beyond it, the window is at fault
+_MAX_SIGMAS_UNDER_WAY = 12.0  # in simulations with the largest calibration errors, principal points reach seven
+_WALK = 0.01  # random walk in one second, as a share of the file's standard deviations
 _ESTIMATE_EVERY_NS = 1_000_000_000
 
 
 class WindowCalibration:
-    """What is known of the calibration of a rig of single cameras and an IMU.
+    """Estimate of the calibration of a rig of single cameras and an IMU, as a difference from the rig file.
 
-    The difference from the rig file is ``[cameras C * SINGLE, IMU without its biases 19]``, or empty where the file is
-    taken as it is.
+    The difference is ``[cameras C * SINGLE, IMU without its biases 19]``, or empty where the calibration is not
+    estimated.
 
     Args:
-        rig: of the rig file, with how far its calibration is known.
-        is_estimated: whether the file may turn out to be wrong.
+        rig: rig of the rig file, with the standard deviations of its calibration.
+        is_estimated: whether the calibration is estimated, so that the file may turn out to be wrong.
 
     Attributes:
         size: number F of parameters, 0 where they are not estimated.
         factors: (G,) by which the file's errors exceed its standard deviations, of intrinsics and of extrinsics with
             the IMU; `EXACT` where the file is as good as exact.
         twice_log_bayes_factor: twice the logarithm of the odds of these factors against an exact file.
-        are_stamps_exact: whether framesets' stamps are as good as exact. What others do to a path looks like errors of
-            the calibration, of which nothing is learnt then.
-        latest: what is known of all parameters, updated once a second; None before, and where they are not estimated.
+        are_stamps_exact: whether framesets' stamps are as good as exact. The effect of inexact stamps on a trajectory
+            looks like errors of the calibration, so that nothing is learnt of the calibration then.
+        latest: newest estimate of all parameters, updated once a second; None before, and where they are not estimated.
     """
 
     def __init__(self, rig: Rig, is_estimated: bool = True) -> None:
@@ -86,7 +87,7 @@ class WindowCalibration:
 
     @property
     def is_file_exact(self) -> bool:
-        """Whether the measurements say nothing against the rig file."""
+        """Whether the rig file is taken as exact, since the measurements do not contradict it."""
         return self.is_exact(self.factors)
 
     def is_exact(self, factors: Float) -> bool:
@@ -95,17 +96,18 @@ class WindowCalibration:
 
     @property
     def candidates(self) -> list[Float]:
-        """Factors (G,) with which a first window is tried."""
+        """Factors (G,) of the rig file's errors with which a first window is solved, in the order of the attempts."""
         if self._prior.estimated and not self.are_stamps_exact:
-            return [np.full(self._prior.n_groups, EXACT)]  # nothing is to be learnt of it: it is taken as it is
+            return [np.full(self._prior.n_groups, EXACT)]  # nothing can be learnt: the file is taken as it is
         if not (self.is_file_exact and self.size and self.are_stamps_exact):
             return [self.factors]
         return [self.factors, *(np.full(self._prior.n_groups, factor) for factor in _FIRST_FACTORS)]
 
     def file(self, factors: Float | None = None) -> Gaussian | None:
-        """Return what is known before an epoch: by a rig file that is wrong by some factors (G,), and earlier epochs.
+        """Return the prior of the calibration before an epoch, by rig file and earlier epochs; None for an exact file.
 
-        None where the file is exact. Without an argument, of the file as wrong as it is taken for now.
+        Args:
+            factors: (G,) by which the file's errors exceed its standard deviations; None for the current ones.
         """
         factors = self.factors if factors is None else factors
         if self.is_exact(factors):
@@ -117,15 +119,15 @@ class WindowCalibration:
         return self._files[key]
 
     def is_plausible(self, difference: Float) -> bool:
-        """Return whether a difference (F,) is within four standard deviations of a file that is as wrong as any."""
+        """Return whether a difference (F,) is within four of the rig file's standard deviations times `MAX_FACTOR`."""
         return self._is_within(_MAX_SIGMAS, difference)
 
     def is_possible(self, difference: Float) -> bool:
-        """Return whether a difference (F,), of a window under way, is one that sensors may have.
+        """Return whether real sensors may have a difference (F,) that a window of an epoch under way has found.
 
-        While little is known of a parameter, it may for a moment be three times as far off as is plausible. But the IMU
-        may not have scales and axes that no rig has. An empty difference, of a calibration that is not estimated, is
-        possible.
+        While little is known of a parameter, it may for a moment be three times as far off as `is_plausible` allows.
+        The IMU's scales and axes, however, have to be within the limits of a rig file. An empty difference, of a
+        calibration that is not estimated, is possible.
         """
         if not len(difference):
             return True
@@ -136,14 +138,14 @@ class WindowCalibration:
         return is_rig and self._is_within(_MAX_SIGMAS_UNDER_WAY, difference)
 
     def _is_within(self, max_sigmas: float, difference: Float) -> bool:
-        """Return whether a difference (F,) is within so many standard deviations of a file that is as wrong as any."""
+        """Return whether a difference (F,) is within some of the rig file's standard deviations times `MAX_FACTOR`."""
         sigmas = MAX_FACTOR * np.sqrt(np.diag(self._prior.covariance))
         return bool((np.abs(difference) <= max_sigmas * sigmas).all())
 
     def walk(self, seconds: float) -> Float:
-        """Return the lower Cholesky factor (6 + F, 6 + F) of what biases and calibration change in some time.
+        """Return the lower Cholesky factor (6 + F, 6 + F) of the covariance by which biases and calibration walk.
 
-        Of a file that is exact, the calibration stays.
+        The calibration of an exact file does not walk.
         """
         n = len(self._bias_walks)
         walk = np.zeros((n + self.size, n + self.size))
@@ -153,32 +155,32 @@ class WindowCalibration:
         return np.asarray(np.sqrt(seconds) * walk)
 
     def likeliest_factors(self, evidence: Evidence) -> Float:
-        """Return by which factors (G,) the rig file is most likely wrong, given that it is not exact."""
+        """Return the likeliest factors (G,) by which the rig file is wrong, given that it is not exact."""
         found, _ = self._kept.plus(evidence).file_factors(self._prior, np.zeros(self._prior.n_groups))
         return np.maximum(found, _MIN_FACTOR)
 
     def begin(self, factors: Float) -> None:
-        """Begin with a window that is adjusted with some factors (G,)."""
+        """Begin an epoch with a window that was adjusted with some factors (G,)."""
         self.factors = self._first_factors = factors
 
     def keep(self) -> None:
-        """Keep what is known beyond the end of an epoch."""
+        """Keep the evidence of the epoch that ends for later epochs."""
         self._kept = self._evidence
         self._files.clear()
 
     def discard(self) -> None:
-        """Forget what the epoch that ends has shown."""
+        """Discard the evidence of the epoch that ends."""
         self.factors, self._evidence = self._first_factors, self._kept
 
     def forget(self) -> None:
-        """Forget what ended epochs have shown: no motion fits it."""
+        """Forget the evidence of earlier epochs, since no motion fits it."""
         self._kept = Evidence.none(len(self._rows))
         self._files.clear()
 
     def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
-        """Return whether a first window, adjusted with an exact file, says that its extrinsics or IMU are far off.
+        """Return whether a first window, adjusted with an exact file, shows that extrinsics or IMU are far off.
 
-        Arguments as `update_factors`.
+        For arguments see `update_factors`.
         """
         if not (self.size and self.are_stamps_exact):
             return False
@@ -189,11 +191,11 @@ class WindowCalibration:
     def update_factors(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Update the factors of the rig file from a window, and return whether they have changed.
 
-        Of a file that is exact once a second, since it takes a linearisation of its own.
+        With an exact file this happens once a second, since it takes an additional linearisation.
 
         Args:
-            adjusted: window.
-            prior: from before the window.
+            adjusted: the adjusted window.
+            prior: prior of states from before the window, or None.
         """
         if not self.size:
             return False
@@ -204,17 +206,17 @@ class WindowCalibration:
         return self.update(evidence_of(adjusted.equations, adjusted.states, file))
 
     def _evidence_of(self, adjusted: Adjusted, prior: Prior | None) -> Evidence:
-        """Return what a window that was adjusted with an exact file says of it."""
+        """Return the evidence about the calibration of a window that was adjusted with an exact file."""
         file = Gaussian(np.zeros(self.size), np.zeros((self.size, self.size)))
         at = equations(adjusted.measured, adjusted.states, adjusted.landmarks, prior, file)
         return evidence_of(at, adjusted.states, file)
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Whether what is known of all parameters was last noted a second ago."""
+        """Return whether `latest` is at least a second old."""
         return stamp_ns - self._latest_ns >= _ESTIMATE_EVERY_NS
 
     def update(self, evidence: Evidence) -> bool:
-        """Use what the window and what left it say of the calibration.
+        """Update the factors from the evidence of the window, which includes that of states that left it.
 
         Returns:
             Whether the factors have changed.
@@ -227,7 +229,7 @@ class WindowCalibration:
             self._prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood
         )
         if not (self.is_file_exact and self.is_exact(found)):
-            # Errors that the tracks of one camera have in common look like those of a lens: it is not as wrong as any.
+            # Errors that all tracks of a camera share look like those of its lens: this factor does not grow.
             of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
             likeliest = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
             if self.is_file_exact or likelihood(likeliest) - likelihood(before) > _MIN_TWICE_LOG_RATIO:
@@ -235,12 +237,12 @@ class WindowCalibration:
         return not np.array_equal(self.factors, before)
 
     def note(self, stamp_ns: int, states: States, covariance: StateCovariance) -> None:
-        """Keep what is known of all parameters, once a second.
+        """Update `latest`, at most once a second.
 
         Args:
-            stamp_ns: of the newest state.
-            states: with the difference that is in force.
-            covariance: of the newest state, and of the biases.
+            stamp_ns: stamp of the newest state.
+            states: states of the window, with the difference that is in force.
+            covariance: covariance of the newest state, and of the biases.
         """
         if not self.size or not self._is_due(stamp_ns):
             return
@@ -260,5 +262,5 @@ class WindowCalibration:
 
 
 def time_offset_s(difference: Float) -> float:
-    """Return the time offset that is in force, less the rig file's, of a difference (F,); 0 of an empty one."""
+    """Return by how much the time offset of a difference (F,) exceeds the rig file's, seconds; 0 if it is empty."""
     return float(difference[TIME_OFFSET - PARAMETERS]) if len(difference) else 0.0

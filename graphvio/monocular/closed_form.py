@@ -6,8 +6,8 @@ IJCV 106(2), 2014. The gyro's bias is the one for which the equations fit best: 
 initialization and gyroscope bias calibration in visual inertial aided navigation*, RA-L 2(1), 2017.
 
 In metres the equations have an attractive wrong solution: with small distances and no motion all errors are small. A
-vehicle that accelerates evenly was taken for one that stands and is tilted. The unit of length is therefore the
-motion itself, and the length of a metre is one of the unknowns.
+vehicle that accelerates evenly was taken for one that stands and is tilted. The unit of length is therefore the size
+of the motion, the rms of the keyframes' positions, and the length of a metre in this unit is one of the unknowns.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.preintegration import preintegrate
 
 _ROUNDS = 8
-_BIAS_STEP = 1e-4  # rad/s, of the numerical derivatives
+_BIAS_STEP = 1e-4  # rad/s, step of the numerical derivatives
 _MAX_BIAS_STEP = 0.05
 _CONVERGED = 5e-3  # rad/s: the adjustment that follows is exact
-_ROBUST_SCALE = 3.0  # of the Cauchy weights, in medians of the errors
+_ROBUST_SCALE = 3.0  # scale of the Cauchy weights, in medians of the errors
 _LENGTH_ROUNDS = 4
 _MIN_LANDMARKS = 8
-_MIN_DISTANCE = 1e-2  # of a landmark, in lengths of the motion
-_BIAS_SIGMA = 0.1  # rad/s, known beforehand
-_ANGLE_SIGMA = 2e-3  # of a ray, rad, against that
+_MIN_DISTANCE = 1e-2  # of a landmark, in units of the motion's size
+_BIAS_SIGMA = 0.1  # rad/s, prior of the gyro's bias
+_ANGLE_SIGMA = 2e-3  # rad, of a ray: weighs the rays against that prior
 
 
 class FirstGuess(NamedTuple):
-    """Motion of K keyframes, frame body at the first of them.
+    """Guessed motion of K keyframes, in the body frame of the first of them.
 
     Attributes:
-        poses: (K, 4, 4) of body.
+        poses: (K, 4, 4) poses of body.
         velocities: (K, 3) m/s.
         gravity: (3,) m/s^2, downwards.
         gyro_bias: (3,) rad/s.
@@ -55,7 +55,10 @@ class FirstGuess(NamedTuple):
 
 
 class _Chain(NamedTuple):
-    """The IMU since the first keyframe: times (K,), rotations (K, 3, 3), velocities and positions without gravity."""
+    """The IMU integrated since the first keyframe, without gravity and initial velocity.
+
+    These are times (K,) in seconds, rotations (K, 3, 3), velocities (K, 3) m/s and positions (K, 3) m.
+    """
 
     times: Float
     rotations: Float
@@ -64,9 +67,9 @@ class _Chain(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """N views of L landmarks, sorted by landmark; a point that several cameras see is a landmark of each.
+    """N views of L landmarks, sorted by landmark; a point that several cameras see is one landmark for each camera.
 
-    What cameras see of each other's points would give the scale, but a wrong rig file gives a wrong one.
+    Matches between cameras would give the scale, but with a wrong rig file they give a wrong one.
     """
 
     state: Int  # (N,)
@@ -74,12 +77,12 @@ class _Views(NamedTuple):
     firsts: Int  # (L,) first view of each
     rays: Float  # (N, 3) of unit length, in body
     levers: Float  # (N, 3) m, of the cameras in body
-    delays: Float  # (N,) s, of rolling shutters' lines
+    delays: Float  # (N,) s, from the stamp until a rolling shutter's line is exposed
     weights: Float  # (N,)
 
     @staticmethod
     def of(structure: Structure, cameras: Cameras) -> _Views:
-        """Collect the views of landmarks that a camera sees twice at least."""
+        """Collect the views of landmarks that a camera sees at least twice."""
         n_cameras = len(cameras.body_T_cam)
         point = np.repeat(np.arange(len(structure.odom_T_landmark)), np.diff(structure.rows))
         _, landmark, counts = np.unique(point * n_cameras + structure.camera, return_inverse=True, return_counts=True)
@@ -109,9 +112,9 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
     """Solve for the motion of the keyframes of ``samples``, which are the states of ``structure``.
 
     Args:
-        samples: of the IMU, and the stamps of the K keyframes.
-        structure: landmarks with two views at least.
-        cameras: that see them.
+        samples: IMU samples, and the stamps of the K keyframes.
+        structure: landmarks with at least two views.
+        cameras: cameras that see them.
         gyro_bias: (3,) rad/s from which the search begins.
 
     Raises:
@@ -137,7 +140,7 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
 
 
 def _reweighted(views: _Views, at: _Equations) -> _Views:
-    """Weight views such that errors are angles, and those of mismatches count little."""
+    """Return the views with weights that make errors angles, and let those of mismatches count little."""
     motion = _shortest(at.normal, at.length)
     distances = _distances(at, motion)[views.landmark]
     angles = np.linalg.norm(_errors(at, views, motion), axis=1) / views.weights / distances
@@ -146,7 +149,7 @@ def _reweighted(views: _Views, at: _Equations) -> _Views:
 
 
 def _bias_step(samples: InertialSamples, views: _Views, bias: Float, known_bias: Float) -> Float:
-    """Return the step (3,) rad/s of Gauss and Newton from a gyro bias to the one for which the equations fit best.
+    """Return the Gauss-Newton step (3,) rad/s from a gyro bias to the one for which the equations fit best.
 
     Errors are compared at the same distances: a bias by which all points are nearer would make all errors smaller.
     """
@@ -170,11 +173,11 @@ def _bias_step(samples: InertialSamples, views: _Views, bias: Float, known_bias:
 
 
 def _metric_motion(chain: _Chain, views: _Views) -> tuple[Float, Float]:
-    """Return velocity (3,) m/s and gravity (3,) m/s^2 of its known length, in body at the first keyframe."""
+    """Return velocity (3,) m/s and gravity (3,) m/s^2 with its known norm, in body at the first keyframe."""
     at = _equations(chain, views)
 
     def motion(gravity: Float, across: Float) -> Float:
-        """Return the best motion whose gravity is a given one, in metres, and any sum of others across it (3, A)."""
+        """Return the best motion (7,) whose gravity is the given one, in metres, plus any sum of ``across`` (3, A)."""
         basis = np.zeros((7, 4 + across.shape[1]))
         basis[:3, :3], basis[3:6, 3:-1], basis[3:6, -1], basis[6, -1] = np.eye(3), across, gravity, 1.0
         normal, length = (product(product(basis.T.copy(), each), basis) for each in (at.normal, at.length))
@@ -213,7 +216,7 @@ def _chain(samples: InertialSamples, gyro_bias: Float) -> _Chain:
 
 
 def _equations(chain: _Chain, views: _Views) -> _Equations:
-    """Collect the equations, each weighted, of the views of a motion with given rotations."""
+    """Collect the weighted equations of all views, for the rotations of the integrated IMU."""
     k, first, weights = views.state, views.firsts[views.landmark], views.weights[:, None, None]
     rays = np.einsum("nij,nj->ni", chain.rotations[k], views.rays)
     delays, times = views.delays, chain.times[k] + views.delays
@@ -238,7 +241,7 @@ def _equations(chain: _Chain, views: _Views) -> _Equations:
 
 
 def _distances(at: _Equations, motion: Float) -> Float:
-    """Return the distances (L,) of the landmarks that fit a motion (7,), not less than a bound."""
+    """Return the absolute distances (L,) of the landmarks that fit a motion (7,) best, at least `_MIN_DISTANCE`."""
     return np.asarray(np.maximum(np.abs(np.einsum("lj,j->l", at.gain, motion)), _MIN_DISTANCE))
 
 
@@ -249,7 +252,7 @@ def _errors(at: _Equations, views: _Views, motion: Float) -> Float:
 
 
 def _shortest(matrix: Float, norm: Float) -> Float:
-    """Return the vector x (M,), its last not negative, with the smallest ``x matrix x`` where ``x norm x = 1``.
+    """Return the vector x (M,), its last element not negative, with least ``x matrix x`` where ``x norm x = 1``.
 
     Raises:
         numpy.linalg.LinAlgError: if there is none.

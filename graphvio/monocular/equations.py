@@ -26,23 +26,23 @@ from graphvio.monocular.structure import (
 from graphvio.self_calibration.bundle import inverse3
 from graphvio.self_calibration.parameters import CAMERA, SINGLE
 
-_ERROR2_BEHIND = 1e6  # of a landmark behind the camera
-_MAX_INVERSE_DEPTH = PRIOR_INFORMATION**-0.5  # 10 / m; what is nearer is a mismatch, and would hold the poses
+_ERROR2_BEHIND = 1e6  # squared whitened error of a landmark behind the camera
+_MAX_INVERSE_DEPTH = PRIOR_INFORMATION**-0.5  # 10 / m; nearer landmarks are mismatches, and would hold the poses
 
 
 class _Sums(NamedTuple):
-    """Sums of `visual_equations` for V cameras and K poses, and what belongs to the landmark that is being eliminated.
+    """Sums of `visual_equations` for V cameras and K poses, and terms of the landmark that is being eliminated.
 
     Attributes:
-        of_states: (K V, 6, 24) over all views of a camera from a state, by the columns of `whiten_view`.
-        of_cameras: (V V, SINGLE, 16) the same of two cameras.
-        coupled: (3, 6 K + n) the landmark's couplings with all unknowns.
-        weighed: (3, 6 K + n) these times its inverse normal matrix.
-        seen: (V,) which cameras see it, where their calibration is unknown.
-        by_camera: (V, 3, 16) its couplings with these.
-        of_camera: (3, 16) those of one camera times its inverse normal matrix.
-        normal: (3, 3) its normal matrix, the upper triangle.
-        gradient: (3,).
+        of_states: (K V, 6, 24) sums over all views of a camera from a state, by the columns of `whiten_view`.
+        of_cameras: (V V, SINGLE, 16) likewise, of the parameters of one camera with those of another one and the error.
+        coupled: (3, 6 K + n) couplings of the landmark with all unknowns.
+        weighed: (3, 6 K + n) these couplings, multiplied by the landmark's inverse normal matrix.
+        seen: (V,) whether each camera sees the landmark, where the cameras' calibration is unknown.
+        by_camera: (V, 3, 16) couplings of the landmark with each camera's calibration.
+        of_camera: (3, 16) those with one camera, multiplied by the landmark's inverse normal matrix.
+        normal: (3, 3) upper triangle of the landmark's normal matrix.
+        gradient: (3,) gradient of the cost with respect to the landmark.
     """
 
     of_states: Float
@@ -76,13 +76,13 @@ def visual_equations(
 
     Args:
         poses: (K, 4, 4) ``odom_T_body``; perturbed on the right, ``R Exp(r)``, ``p + R t``.
-        falls: (K, 2, 3) by which rolling shutters move on, see `graphvio.monocular.states.States`.
-        cameras: that see the landmarks.
+        falls: (K, 2, 3) motion of body in free fall, for rolling shutters, see `graphvio.monocular.states.States`.
+        cameras: cameras that see the landmarks.
         landmarks: (L, 3).
-        structure: of these.
+        structure: views of the landmarks.
         sigma_px: noise of a corner's position.
-        depth_information: of an inverse depth, that it is `PRIOR_INVERSE_DEPTH`.
-        scale: of the Cauchy cost, in whitened units.
+        depth_information: information of the prior that an inverse depth is `PRIOR_INVERSE_DEPTH`, m^2.
+        scale: scale of the Cauchy cost, in whitened units.
         eliminated: output; its size says whether the cameras' calibration is unknown, too.
 
     Returns:
@@ -93,7 +93,7 @@ def visual_equations(
     size, calibrates = POSE * len(poses) + n_calibration, n_calibration > 0
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     errors2, cost, rows = np.zeros(len(structure.state)), 0.0, np.zeros((2, COLUMNS))
-    # Lengths 16 and 24 that the compiler does not know: else it writes loops out number by number, without vectors.
+    # Lengths 16 and 24, hidden from the compiler: if it knew them, it would unroll the loops and not vectorise them.
     of_one, of_both = 4 * cameras.intrinsics.shape[1], 6 * cameras.intrinsics.shape[1]
     per_scale2 = 1.0 / (scale * scale)
     by_lens = np.zeros((2 if calibrates or have_moved(cameras) else 0, CAMERA))
@@ -134,7 +134,16 @@ def visual_equations(
 
 @vector_kernel
 def _begin_landmark(sums: _Sums, begin: int, end: int, of_one: int, information: float, away: float) -> None:
-    """Begin the sums of a landmark with its prior, which its inverse depth is away from; it is seen in some columns."""
+    """Reset the sums for a landmark, and add its prior.
+
+    Args:
+        sums: is changed.
+        begin: first column of the poses that may see the landmark.
+        end: end of these columns.
+        of_one: 16.
+        information: information of the prior inverse depth.
+        away: difference of the inverse depth from its prior.
+    """
     normal, gradient = sums.normal, sums.gradient
     for r in range(3):
         gradient[r] = 0.0
@@ -159,14 +168,14 @@ def _add_view(
     """Add a view to the sums of its landmark, its state and its camera.
 
     Args:
-        u: (COLUMNS,) derivatives of the error in x, and the error.
-        v: (COLUMNS,) of the error in y.
+        u: (COLUMNS,) derivatives of the error in x, and that error.
+        v: (COLUMNS,) the same of the error in y.
         k: index of the state.
         j: index of the camera.
-        n_cameras: of the rig.
+        n_cameras: number of cameras of the rig.
         calibrates: whether the cameras' calibration is unknown.
-        of_one: 16.
-        of_both: 24.
+        of_one: 16, number of columns of a camera and the error.
+        of_both: 24, number of columns with the pose, too.
         sums: are added to.
         by_pose: (3, 6) output, coupling of the landmark with the pose.
     """
@@ -210,15 +219,15 @@ def _eliminate(
     """Eliminate a landmark once all its views are added.
 
     Args:
-        point: the landmark.
-        structure: of all landmarks.
-        n_states: K.
-        n_cameras: of the rig.
+        point: index of the landmark.
+        structure: views of all landmarks.
+        n_states: number K of states.
+        n_cameras: number of cameras of the rig.
         of_one: 16.
         sums: are changed.
         hessian: (6 K + n, 6 K + n) is changed.
         gradient: (6 K + n,) is changed.
-        eliminated: output; it has the landmark's couplings with the poses.
+        eliminated: output; its couplings of the landmark with the poses are input.
     """
     states = structure.state[structure.rows[point]], structure.state[structure.rows[point + 1] - 1] + 1
     begin, end, n_poses = POSE * states[0], POSE * states[1], POSE * n_states
@@ -280,17 +289,17 @@ def _weigh(
     """Multiply a landmark's couplings with some unknowns by its inverse normal matrix, and eliminate its gradient.
 
     Args:
-        inverse: (3, 3) of its normal matrix.
-        coupled: (3, n) couplings.
-        begin: first of the unknowns.
-        end: of these.
-        weighed: (3, n), output in their columns.
-        of_landmark: (3,) its gradient.
+        inverse: (3, 3) inverse of the landmark's normal matrix.
+        coupled: (3, n) couplings with all unknowns.
+        begin: index of the first of the unknowns.
+        end: end of the unknowns.
+        weighed: (3, n) output, in the columns of the unknowns.
+        of_landmark: (3,) gradient of the landmark.
         gradient: (n,) is changed.
     """
     b0, b1, b2 = of_landmark[0], of_landmark[1], of_landmark[2]
     if begin < 0:
-        return  # never: but the compiler learns from it that no index counts from the end
+        return  # never happens: it shows the compiler that no index is negative
     for c in range(begin, end):
         a0, a1, a2 = coupled[0, c], coupled[1, c], coupled[2, c]
         t0 = inverse[0, 0] * a0 + inverse[0, 1] * a1 + inverse[0, 2] * a2
@@ -302,9 +311,9 @@ def _weigh(
 
 @vector_kernel
 def _subtract(coupled: Float, weighed: Float, row: int, begin: int, end: int, hessian: Float) -> None:
-    """Subtract what a landmark takes from one row of the normal equations (n, n), in some columns of it."""
+    """Subtract a landmark's share, as it is eliminated, from some columns of one row of the normal equations (n, n)."""
     a0, a1, a2 = coupled[0, row], coupled[1, row], coupled[2, row]
-    if begin < 0 or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0):  # the state does not see it
+    if begin < 0 or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0):  # the state does not see the landmark
         return
     for d in range(begin, end):
         hessian[row, d] -= a0 * weighed[0, d] + a1 * weighed[1, d] + a2 * weighed[2, d]
@@ -312,14 +321,14 @@ def _subtract(coupled: Float, weighed: Float, row: int, begin: int, end: int, he
 
 @vector_kernel
 def _subtract_block(coupled: Float, at: int, of_camera: Float, n_columns: int, sums: Float) -> None:
-    """Subtract what a landmark takes from the normal equations of a few unknowns and a camera.
+    """Subtract a landmark's share, as it is eliminated, from the equations of a few unknowns with a camera.
 
     Args:
-        coupled: (3, n) couplings of all unknowns.
-        at: first of the few.
-        of_camera: (3, 16) what the camera's couplings were weighed to; the last column is zero.
+        coupled: (3, n) couplings with all unknowns.
+        at: index of the first of the few unknowns.
+        of_camera: (3, 16) the camera's couplings, multiplied by the inverse normal matrix; the last column is zero.
         n_columns: 16.
-        sums: (R, 16 at least) of R unknowns, is changed.
+        sums: (R, 16 at least) sums of R unknowns, is changed.
     """
     for c in range(len(sums)):
         a0, a1, a2 = coupled[0, at + c], coupled[1, at + c], coupled[2, at + c]

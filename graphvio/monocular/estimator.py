@@ -1,7 +1,7 @@
-"""State of a rig of single cameras and an IMU: a window of keyframes with landmarks, solved at each frameset.
+"""State estimator of a rig of single cameras and an IMU: a window of keyframes with landmarks, solved at each frameset.
 
 Scale is part of the state: positions are in metres by the accelerometer, and their covariance includes the uncertainty
-of the scale. Until an `Initialiser` knows it there is no pose.
+of the scale. There is no pose until an `Initialiser` has found the scale.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 
 _MAX_CONTRADICTION_NS = 1_000_000_000
-_MAX_STAMP_SIGMA_S = 3e-4  # beyond which a window's errors are those of stamps, and not of the calibration
+_MAX_STAMP_SIGMA_S = 3e-4  # with less exact stamps, a window's errors come from these, not from the calibration
 _MAX_IMU_ERROR2 = 150.0
-_MAX_STANDSTILL_NS = 1_000_000_000  # from the initialisation until images show it
+_MAX_STANDSTILL_NS = 1_000_000_000  # from the initialisation until the images confirm the standstill
 _REPORT_AFTER_NS = 5_000_000_000
 _TURNS_OTHERWISE = "the IMU turns otherwise than the cameras"
 
 
 class MonocularEstimator:
-    """A `graphvio.backend.estimator.StateEstimator` of single cameras and an IMU.
+    """A `graphvio.backend.estimator.StateEstimator` for a rig of single cameras and an IMU.
 
     Args:
-        rig: Single cameras and an IMU.
+        rig: The rig, with single cameras and an IMU.
         config: Configuration of all stages.
-        report: Receives events.
+        report: Function that receives events.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
@@ -62,19 +62,19 @@ class MonocularEstimator:
         self._calibration = WindowCalibration(rig, config.estimates_calibration)
         self._samples = self._new_samples()
         self._solver = WindowSolver(self._cameras, self._calibration, self._samples)
-        self._shift_ns = 0  # of samples' stamps, for what the time offset was corrected by
+        self._shift_ns = 0  # added to samples' stamps, to undo corrections of the time offset
         self._has_imu = self._is_initialised = self._is_imu_doubted = False
         self._collect_keyframes()
         self._has_overlaps, self._are_trusted = False, True
         self._window: KeyframeWindow | None = None
         self._latest_ns = 0
-        self._since_ns = 0  # of the initialisation
+        self._since_ns = 0  # stamp of the initialisation, or of the end of the epoch before
         self._is_reported = False
-        self._is_keyframe = True  # the newest state of the window
-        self._before: tuple[int, Float] | None = None  # the state before the newest one, where it has left the window
+        self._is_keyframe = True  # whether the newest state of the window is one
+        self._before: tuple[int, Float] | None = None  # stamp and pose of the previous state, also once it has left
         self._camera_tracks: dict[int, CameraTracks] = {}
         self._is_stationary = False
-        self._standstill: InitialAttitude | None = None  # that the IMU shows at the first frameset
+        self._standstill: InitialAttitude | None = None  # by the IMU at the first frameset, if it shows a standstill
         self._tracked_sigma_m = 0.0
         self._contradicted_since_ns: int | None = None
         self._rate: Float | None = None
@@ -83,7 +83,7 @@ class MonocularEstimator:
 
     @property
     def is_initialised(self) -> bool:
-        """Whether keyframes are collected, at least."""
+        """Whether `initialise` has been called, so that at least keyframes are collected."""
         return self._is_initialised
 
     @property
@@ -93,12 +93,12 @@ class MonocularEstimator:
 
     @property
     def has_imu(self) -> bool:
-        """Whether the IMU has come."""
+        """Whether there were IMU samples at the initialisation."""
         return self._has_imu
 
     @property
     def calibration(self) -> CalibrationEstimate | None:
-        """What is known of the calibration, updated once a second; None before the first pose, and where it is not."""
+        """The estimated calibration, updated once a second; None before the first pose, or if it is not estimated."""
         return self._calibration.latest
 
     @property
@@ -122,7 +122,7 @@ class MonocularEstimator:
         return self._rate
 
     def motion_since(self, then_ns: int) -> Float | None:
-        """Return ``now_T_then`` (4, 4) of body from a state of the window, or the one before the newest."""
+        """Return ``now_T_then`` (4, 4) of body since a state of the window or the previous state, None if unknown."""
         if self._window is None:
             return None
         states = self._window.states
@@ -136,7 +136,7 @@ class MonocularEstimator:
         return np.ascontiguousarray(se3_inverse(states.poses[-1]) @ then)
 
     def covariance_since(self, then_ns: int) -> Float | None:
-        """Return the covariance (6, 6) of the motion since a keyframe of the window, in body at the newest state."""
+        """Return the covariance (6, 6) of the motion since a keyframe of the window, in the newest body frame."""
         return self._solver.covariance_since(then_ns)
 
     def located_points(self) -> dict[int, LocatedPoints]:
@@ -148,12 +148,12 @@ class MonocularEstimator:
         return self._solver.take_final()
 
     def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
-        """Hand over the views of each landmark once, when it leaves the window, or the window ends.
+        """Register a function that gets the views of each landmark once, as it leaves the window or the window ends.
 
-        What is known from before an epoch's first pose comes as one.
+        What is known from before an epoch's first pose is handed over once, as a `FirstWindow`.
 
         Args:
-            on_views: called within `update` and `finish`.
+            on_views: Function that is called within `update` and `finish`.
         """
         self._solver.on_views(on_views)
 
@@ -171,7 +171,7 @@ class MonocularEstimator:
         self._samples.add(stamp_ns + self._shift_ns, values)
 
     def shift_samples(self, shift_ns: int) -> None:
-        """Record that stamps of samples have a correction of the time offset from now on, which is a state here."""
+        """Record a correction of the time offset: it is undone for later samples, since the offset is a state here."""
         self._shift_ns += shift_ns
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
@@ -185,7 +185,11 @@ class MonocularEstimator:
             self._standstill = attitude if attitude.is_stationary else None
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
-        """Add a state by the IMU; where that has been silent for 5 s, the epoch ends."""
+        """Add a state predicted by the IMU.
+
+        Where the IMU has been silent for more than 5 s, the epoch ends. Before the first pose, any gap discards the
+        keyframes that were collected.
+        """
         self.gate_results = {}
         self._rate = None
         window, before_ns = self._window, self._latest_ns
@@ -212,7 +216,7 @@ class MonocularEstimator:
         return False
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
-        """Record what the cameras see; it is tested when the window is solved."""
+        """Record what the cameras see at the newest frameset; outliers are found when the window is solved."""
         self._has_overlaps |= shared_points(visual.camera_tracks) > 0
         seen = dict(visual.camera_tracks) if self._are_trusted else alone(visual.camera_tracks)
         self._camera_tracks, self._is_stationary = seen, is_stationary
@@ -221,14 +225,14 @@ class MonocularEstimator:
         return MeasurementUpdate(None)
 
     def _use_standstill(self) -> None:
-        """Set the gyro's bias by the standstill that the IMU showed, once images show it: a steady turn looks alike."""
+        """Set the gyro bias prior from the IMU's standstill once images confirm it: a steady turn looks the same."""
         standstill, self._standstill = self._standstill, None
         if standstill is not None and self._latest_ns - self._since_ns <= _MAX_STANDSTILL_NS:
             self._initialiser.set_gyro_bias_prior(standstill.gyro_bias, standstill.gyro_bias_sigma)
             self._trust.set_gyro_bias_prior(standstill.gyro_bias, standstill.gyro_bias_sigma)
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
-        """Solve the window, or look for the scale."""
+        """Solve the window at the newest frameset or, before the first pose, look for the scale."""
         is_keyframe = stamp_ns in keep
         if self._window is None:
             return self._initialising(stamp_ns, is_keyframe)
@@ -244,7 +248,7 @@ class MonocularEstimator:
             return StateUpdate(Status.LOST)
 
     def _initialising(self, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
-        """Collect keyframes, and begin the window once the scale is known."""
+        """Give the frameset to the initialiser if it is a keyframe, and begin the window once the scale is known."""
         if self._has_imu and not self._is_imu_doubted and (is_keyframe or self._is_stationary):
             window = self._initialiser.add(stamp_ns, self._camera_tracks, self._is_stationary)
             instead = self._drop_wrong_overlaps(stamp_ns, window)
@@ -268,7 +272,7 @@ class MonocularEstimator:
         )
 
     def _begin(self, window: KeyframeWindow, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
-        """Begin with a window whose scale is known."""
+        """Begin with a window whose scale is known, and solve it at the newest frameset."""
         self._window, self._is_keyframe, self._before = window, True, None
         self._solver.begin(window, stamp_ns)
         self.initialisations += 1
@@ -280,9 +284,10 @@ class MonocularEstimator:
         return self._solve(window, stamp_ns, is_keyframe, is_new=True)
 
     def _drop_wrong_overlaps(self, stamp_ns: int, window: KeyframeWindow | None) -> KeyframeWindow | None:
-        """Stop using overlaps once they prove wrong, and return a window without them; None while they are right.
+        """Stop using overlapping views once they prove wrong, and return a window without them; None if they are right.
 
-        Once the calibration is estimated, the window itself finds out how the cameras are turned to each other.
+        This is for an exact rig file only: once the calibration is estimated, the window itself estimates the rotations
+        between the cameras.
         """
         is_exact = self._calibration.is_file_exact and (window is None or self._calibration.is_exact(window.factors))
         if not (self._has_overlaps and self._are_trusted and is_exact):
@@ -306,7 +311,11 @@ class MonocularEstimator:
         return StateUpdate(self._judge(stamp_ns, solution), outliers=solution.dropped)
 
     def _judge(self, stamp_ns: int, solution: Solution) -> Status:
-        """Return the status by a solution; end the epoch where images and IMU contradict each other for long."""
+        """Return the status after a solution, and end the epoch where it is lost.
+
+        It is lost where no possible calibration explains the measurements, where images and IMU have contradicted each
+        other for 1 s, and where the position has become too uncertain since vision last constrained it.
+        """
         if not solution.is_possible:
             self._solver.discard()
             self._lose(stamp_ns, "images and IMU contradict each other, whatever the calibration")
@@ -337,7 +346,7 @@ class MonocularEstimator:
     def _lose(self, stamp_ns: int, why: str, is_sound: bool = False) -> None:
         """End the epoch: the next one begins once the scale is known again.
 
-        What is known of the calibration is kept where the epoch ends with a sound window.
+        What is known of the calibration is kept only if the window that ends is sound (``is_sound``).
         """
         if self._window is not None:
             self.finish()
@@ -351,7 +360,7 @@ class MonocularEstimator:
         self._since_ns, self._is_reported = stamp_ns, False
 
     def restart_imu(self, stamp_ns: int) -> None:
-        """End the epoch, and forget samples and calibration: they are by a clock that was wrong until a frameset."""
+        """End the epoch, and forget samples and calibration: until this frameset the IMU's clock was wrong."""
         self._lose(stamp_ns, "the IMU's clock is corrected")
         self._calibration = WindowCalibration(self._rig, self._config.estimates_calibration)
         self._samples, self._shift_ns = self._new_samples(), 0
@@ -360,17 +369,17 @@ class MonocularEstimator:
         self._collect_keyframes()
 
     def note_stamps(self, sigma_s: float) -> None:
-        """Set the standard deviation of the framesets' stamps, seconds, as it is known now."""
+        """Set the current estimate of the standard deviation of the framesets' stamps, seconds."""
         self._calibration.are_stamps_exact = sigma_s < _MAX_STAMP_SIGMA_S
 
     def doubt_imu(self, stamp_ns: int, is_doubted: bool) -> None:
-        """Record whether the IMU turns as the cameras do; where it does not, there is no pose."""
+        """Record whether the IMU's rotation contradicts that of the cameras; while it does, there is no pose."""
         self._is_imu_doubted = is_doubted
         if is_doubted and self._window is not None:
             self._lose(stamp_ns, _TURNS_OTHERWISE)
 
     def _collect_keyframes(self) -> None:
-        """Begin to look for the scale."""
+        """Begin to look for the scale, without any keyframes yet."""
         self._initialiser = self._new_initialiser()
         self._trust = OverlapTrust(self._new_initialiser(doubts_file=False))
 
@@ -383,7 +392,7 @@ class MonocularEstimator:
         return Initialiser(self._cameras, self._calibration, samples_of, FIRST_MONOCULAR_SIGMA_PX, doubts_file)
 
     def _oldest_needed_ns(self, stamp_ns: int) -> int:
-        """Return the stamp from which on IMU samples are needed at a frameset."""
+        """Return the stamp since which IMU samples are still needed at a frameset."""
         oldest_ns = self._latest_ns if self._window is None else int(self._window.states.stamps_ns[0])
         if self._window is None and self._initialiser.oldest_ns is not None:
             oldest_ns = self._initialiser.oldest_ns

@@ -1,4 +1,4 @@
-"""Landmarks that are not solved for between keyframes: what they say of these stays as it was linearised."""
+"""Landmarks that are not solved for between keyframes: their views stay as they were linearised."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from graphvio.monocular.window_prior import Prior
 
 
 class HeldLandmarks(NamedTuple):
-    """Landmarks that the newest keyframe does not see: until the next one, what they say stays as it was linearised.
+    """Landmarks that the newest keyframe does not see: until the next one, their views stay as they were linearised.
 
-    They are three quarters of all, and what they say of the keyframes hardly changes.
+    They are three quarters of all, and their information on the keyframes hardly changes.
 
     Attributes:
-        ids: (L,) of the landmarks.
-        measured: their views.
-        places: (L, 3).
-        prior: what they say of the keyframes, with what is known from before.
-        eliminated: what moves them along with the keyframes.
+        ids: (L,) identities of the landmarks.
+        measured: measurements with these landmarks only.
+        places: (L, 3) the landmarks at the linearisation.
+        prior: prior of the keyframes by these views, and from before the window.
+        eliminated: terms of the elimination that move them along with the keyframes.
     """
 
     ids: Int
@@ -39,7 +39,7 @@ class HeldLandmarks(NamedTuple):
         return are_same and not np.isin(self.ids, window.views[-1].landmark).any()
 
     def moved_along(self, states: States) -> tuple[Float, Float]:
-        """Return the landmarks' frames (L, 4, 4) and places (L, 3) for what the states are taken for now."""
+        """Return the landmarks' frames (L, 4, 4) and places (L, 3) for the current estimate of the states."""
         then, n_parameters = self.prior.at, self.eliminated.by_cameras.shape[2]
         now = states.of(np.arange(len(then.poses)))
         step = now.since(then)[visual_columns(len(then.poses), n_parameters, n_parameters)]

@@ -1,8 +1,8 @@
-"""Initialisation: scale, gravity, velocity and biases of a first window, from keyframes in any motion.
+"""Initialisation of single cameras: scale, gravity, velocity and biases of a first window, in any motion.
 
-Until the scale is known nothing is estimated; keyframes are collected, and with each new one a window is solved: first
-in closed form, then by adjustment. It is accepted once its covariance says that the scale is known, and its errors are
-those that the noise accounts for.
+Until the scale is known there is no estimate: keyframes are collected, and with each new one a window is solved, first
+in closed form, then by nonlinear adjustment. It is accepted once its covariance shows that the scale is known, and its
+residuals are no larger than noise explains.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.inertial import InertialSamples
 
 MAX_SCALE_SIGMA = 0.05
-_MIN_KEYFRAMES, _MIN_METRIC_KEYFRAMES = 8, 5  # the latter where baselines know the scale
+_MIN_KEYFRAMES, _MIN_METRIC_KEYFRAMES = 8, 5  # the latter where overlapping views give the scale
 _MIN_DURATION_S, _MIN_METRIC_DURATION_S = 1.0, 0.5
 MAX_DURATION_NS = 5_000_000_000
 _MIN_LANDMARKS = 20
@@ -43,11 +43,11 @@ _MAX_GRAVITY_EXCESS = 0.1  # m/s^2
 _STEPS = 40
 ACCEL_BIAS_SIGMA = 0.15
 _MAX_SIGMAS = 5.0
-_ROUGH, _ROUGH_STEPS = 10.0, 15  # sigmas of the first adjustment by a rig file that is wrong
-_FIRST_DOUBT = 3  # windows that fit no motion with an exact file, until that is doubted
+_ROUGH, _ROUGH_STEPS = 10.0, 15  # factor on the noise, and steps, of a first adjustment with a wrong rig file
+_FIRST_DOUBT = 3  # windows that fit no motion with an exact rig file, before the file is doubted
 _OTHER_SCALES = (0.6, 1.7)
-_MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
-POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
+_MIN_WORSE = 12.5  # excess cost that excludes another scale: it is five standard deviations off
+POSE_SIGMAS = np.full(6, 1e-3)  # of the first pose, which defines nav
 
 
 class _Keyframe(NamedTuple):
@@ -60,11 +60,12 @@ class Initialiser:
     """Collects keyframes until their scale is known.
 
     Args:
-        cameras: of the rig.
-        calibration: says how wrong the rig file may be.
-        samples_of: Returns the IMU's samples of some instants.
+        cameras: cameras of the rig.
+        calibration: how wrong the rig file may be.
+        samples_of: function that returns the IMU samples for keyframes' stamps (K,); its second argument says whether
+            the time offset is known.
         sigma_px: noise of a corner's position.
-        doubts_file: whether windows that fit no motion are tried with a rig file that is wrong.
+        doubts_file: whether windows that fit no motion are solved again with a rig file that is taken to be wrong.
     """
 
     def __init__(
@@ -82,14 +83,14 @@ class Initialiser:
         self._doubts_file = doubts_file
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[_Keyframe] = []
-        self._fits_no_motion = False  # the window that was tested last
-        self._is_file_doubted, self._keyframes_in_doubt = False, 0  # by a window that fits; until the scale is known
-        self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows
+        self._fits_no_motion = False  # whether the window that was tested last fits no motion
+        self._is_file_doubted, self._keyframes_in_doubt = False, 0  # since a window that fits contradicted it
+        self._contradicted, self._doubted_at = 0, _FIRST_DOUBT  # windows without a motion, and how many raise a doubt
         self.reason = "no image has come"
-        self.scale_sigma = np.inf  # of the window that was tested last, as a share
+        self.scale_sigma = np.inf  # sigma of the scale of the window that was tested last, as a share
 
     def set_gyro_bias_prior(self, gyro_bias: Float, sigma: float) -> None:
-        """Set the gyro's bias (3,) rad/s as a standstill shows it."""
+        """Set the prior of the gyro's bias, (3,) rad/s as measured at a standstill, and its standard deviation."""
         self._gyro_bias, self._gyro_bias_sigma = gyro_bias, sigma
 
     @property
@@ -100,9 +101,9 @@ class Initialiser:
     def add(
         self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool
     ) -> KeyframeWindow | None:
-        """Add a keyframe, and return the window if its scale is known."""
+        """Add a keyframe, and return the window if its scale is known; otherwise `reason` says why it is not."""
         if is_stationary and self._keyframes and self._keyframes[-1].is_stationary:
-            self._keyframes.pop()  # of a standstill the newest keyframe stays
+            self._keyframes.pop()  # of a standstill only the newest keyframe is kept
         self._keyframes.append(_Keyframe(stamp_ns, camera_tracks, is_stationary))
         del self._keyframes[:-MAX_KEYFRAMES]
         while stamp_ns - self._keyframes[0].stamp_ns > MAX_DURATION_NS:
@@ -125,7 +126,7 @@ class Initialiser:
         return None
 
     def _next_candidates(self) -> list[Float]:
-        """Return by which factors (G,) the rig file may be wrong, the likeliest first, and count the attempt."""
+        """Return the factors (G,) by which the rig file may be wrong, the likeliest first, and count the attempt."""
         if self._is_file_doubted:  # every other keyframe: each attempt takes as long as many framesets
             self._keyframes_in_doubt += 1
             return self._calibration.candidates[1:] if self._keyframes_in_doubt % 2 else []
@@ -137,7 +138,7 @@ class Initialiser:
         return self._calibration.candidates
 
     def _solved(self, factors: Float) -> KeyframeWindow | None:
-        """Solve for a window of all keyframes with a rig file that is wrong by some factors (G,), and test it."""
+        """Solve for a window of all keyframes with a rig file that is wrong by factors (G,); None if it is rejected."""
         self._fits_no_motion = False
         file = self._calibration.file(factors)
         keyframes, samples = self._covered_keyframes(file)
@@ -188,10 +189,10 @@ class Initialiser:
         return self._in_nav(KeyframeWindow(states, views, still, landmark_ids, landmarks, prior, factors))
 
     def _covered_keyframes(self, file: Gaussian | None) -> tuple[list[_Keyframe], InertialSamples]:
-        """Return the keyframes that the IMU covers whatever its time offset may be, and its samples."""
+        """Return the keyframes that the IMU covers for any possible time offset, and the IMU samples."""
         keyframes = self._keyframes
         samples = self._samples_of(np.array([keyframe.stamp_ns for keyframe in keyframes]), file is None)
-        if file is not None:  # where samples begin too late for some time offsets, these would be out of reach
+        if file is not None:  # else samples that begin late would exclude some time offsets
             since_ns = samples.stamps_ns[0] + MAX_TIME_OFFSET_NS
             keyframes = [keyframe for keyframe in keyframes if keyframe.stamp_ns >= since_ns]
         return keyframes, samples._replace(keyframes_ns=np.array([keyframe.stamp_ns for keyframe in keyframes]))
@@ -211,12 +212,16 @@ class Initialiser:
     def _roughly_adjusted(
         self, measured: Measurements, states: States, places: Float, prior: Prior, file: Gaussian
     ) -> tuple[Measurements, States, Float]:
-        """Adjust as if corners were known badly: by the rig file they are off by pixels, and not yet mismatches."""
+        """Adjust with a larger pixel noise: by a wrong rig file, residuals of several pixels are no mismatches yet."""
         rough = adjust(measured._replace(sigma_px=_ROUGH * self._sigma_px), states, places, prior, _ROUGH_STEPS, file)
         return measured._replace(structure=rough.measured.structure), rough.states, rough.landmarks
 
     def _fault(self, adjusted: Adjusted, fitting: float, factors: Float) -> str:
-        """Say why a window is not accepted, or nothing; a rig file that is wrong by factors understates noise, too."""
+        """Return why a window is not accepted, or an empty string.
+
+        IMU errors may be larger by the largest of the factors (G,): a rig file that is wrong understates the noise,
+        too.
+        """
         wrong_by = float(np.max(factors, initial=1.0))
         states, at = adjusted.states, adjusted.equations
         self._fits_no_motion = True
@@ -235,12 +240,12 @@ class Initialiser:
         return ""
 
     def _is_plausible(self, states: States) -> bool:
-        """Return whether calibration and biases are such as sensors have."""
+        """Return whether calibration and biases are within the range of real sensors."""
         of_accel = np.abs(states.biases[3:]) <= _MAX_SIGMAS * ACCEL_BIAS_SIGMA
         return bool(of_accel.all()) and self._calibration.is_plausible(states.calibration)
 
     def _in_nav(self, window: KeyframeWindow) -> KeyframeWindow:
-        """Turn a window level: its first pose has heading zero, and is the origin."""
+        """Express a window in nav: level, with its first pose at the origin and with heading zero."""
         states = window.states
         body_T_odom = se3_inverse(states.poses[0])
         nav_T_odom = se3(level(-body_T_odom[:3, :3] @ states.gravity), np.zeros(3)) @ body_T_odom
@@ -264,9 +269,9 @@ def shared_points(camera_tracks: Mapping[int, CameraTracks]) -> int:
 
 
 def _ambiguity(adjusted: Adjusted, prior: Prior, file: Gaussian | None) -> str:
-    """Say whether another scale fits as well as the one that was found, or nothing.
+    """Return a message if another scale fits as well as the one that was found, or an empty string.
 
-    A covariance is of one minimum, and says nothing of others: the window is adjusted again from other scales.
+    A covariance describes one minimum only and shows no others: the window is adjusted again from other scales.
     """
     states, cost, structure = adjusted.states, adjusted.equations.cost, adjusted.measured.structure
     for factor in _OTHER_SCALES:

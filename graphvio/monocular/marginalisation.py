@@ -1,4 +1,4 @@
-"""Marginalisation: the first state of a window leaves, with the landmarks that it sees, and what it said stays."""
+"""Marginalisation of a window's first state, with the landmarks that it sees, into a prior of the other states."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
     """Eliminate the first state of a window, with the landmarks that it sees.
 
     Args:
-        measured: with the landmarks that the first state sees, and no others.
-        states: all K of the window.
+        measured: measurements with the landmarks that the first state sees, and no others.
+        states: all K states of the window.
         landmarks: (L, 3).
-        prior: until now.
-        walk: (6 + F, 6 + F) lower Cholesky factor of the covariance of what biases and calibration change until the
+        prior: prior of the window until now, or None.
+        walk: (6 + F, 6 + F) lower Cholesky factor of the covariance by which biases and calibration change until the
             second state.
 
     Returns:
-        What is known of the other states.
+        The prior of the other states.
 
     Raises:
         numpy.linalg.LinAlgError: if nothing determines the first state.
@@ -67,17 +67,17 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
 def with_landmarks(
     measured: Measurements, states: States, landmarks: Float, prior: Prior | None, calibrates: bool
 ) -> tuple[Prior, Eliminated]:
-    """Add what some landmarks say of the states of a window to what is known from before, linearised at these states.
+    """Add the views of some landmarks to the prior of a window's states, linearised at these states.
 
     Args:
-        measured: with these landmarks, and no others.
-        states: all of the window.
+        measured: measurements with these landmarks, and no others.
+        states: all states of the window.
         landmarks: (L, 3).
-        prior: from before.
+        prior: prior from before the window, or None.
         calibrates: whether the calibration is unknown.
 
     Returns:
-        What is known then, and what moves these landmarks along with the states.
+        The prior with these views, and the terms of the elimination that move these landmarks along with the states.
     """
     n_free = len(states.calibration) if calibrates else 0
     hessian, gradient, eliminated = _linearised(measured, states, landmarks, prior, n_free)
@@ -85,7 +85,10 @@ def with_landmarks(
 
 
 def first_window(prior: Prior) -> FirstWindow:
-    """Return what a prior says of poses, gravity, biases and the first velocity: of others it says nothing."""
+    """Return a prior's information on poses, gravity, biases and the first velocity, with the calibration as known.
+
+    A prior has no information on other velocities.
+    """
     n = len(prior.at.poses)
     chosen = np.concatenate([np.arange(6 * n + 3), np.arange(9 * n, 9 * n + GRAVITY + BIASES)])
     return FirstWindow(
@@ -97,7 +100,7 @@ def first_window(prior: Prior) -> FirstWindow:
 def _linearised(
     measured: Measurements, states: States, landmarks: Float, prior: Prior | None, n_free: int
 ) -> tuple[Float, Float, Eliminated]:
-    """Linearise views and prior; the calibration's parameters, F of them or none, are unknown."""
+    """Linearise the views and the prior, with ``n_free`` parameters of the calibration as unknowns: F, or none."""
     n, n_camera_parameters = len(states.poses), states.n_camera_parameters
     eliminated = Eliminated.empty(measured.structure, n_camera_parameters if n_free else 0)
     visual_hessian, visual_gradient, _, _ = visual_equations(
@@ -115,12 +118,13 @@ def _linearised(
 
 
 def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Float]:
-    """Let the last unknowns, biases and calibration, walk: by a lower Cholesky factor of their covariance.
+    """Add a random walk of the last unknowns, biases and calibration, by a lower Cholesky factor of its covariance.
 
-    The change is an unknown of its own, which is eliminated; it has zero mean and, in these units, unit covariance.
+    The change is an unknown of its own, which is eliminated; it has zero mean and, in units of the factor, unit
+    covariance.
     """
     size = len(walk)
-    walk = np.ascontiguousarray(walk[:, walk.any(axis=0)])  # of an exact file, the calibration does not walk
+    walk = np.ascontiguousarray(walk[:, walk.any(axis=0)])  # the calibration of an exact file does not walk
     by_change = product(np.ascontiguousarray(information[:, -size:]), walk)
     of_change = product(np.ascontiguousarray(walk.T), np.ascontiguousarray(by_change[-size:])) + np.eye(walk.shape[1])
     gain = solve_rows(of_change, by_change)

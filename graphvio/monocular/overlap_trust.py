@@ -1,8 +1,8 @@
-"""Whether cameras whose views overlap can be trusted with the scale: the IMU alone is asked once.
+"""Test whether cameras with overlapping views find the right scale, by a window that gets it from the IMU alone.
 
-An error of how two cameras are turned to each other looks like another distance of all points, and no residual shows
-it: half a degree may be a third of the scale. Until the scale is known without what cameras see of each other's
-points, too, keyframes are collected for a window without that.
+An error of the rotation between two cameras changes the distances of all points, and no residual shows it: half a
+degree may change the scale by a third. Until the scale is also known without matches between cameras, keyframes are
+collected for a second window that does not use them.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from graphvio.monocular.states import States, size_m
 from graphvio.monocular.window import KeyframeWindow
 
 _MAX_SIGMAS = 4.0
-_MIN_OFF = 0.025  # seconds after the scale is known, the IMU alone was at most 2.3 % off
+_MIN_OFF = 0.025  # share: seconds after the scale is known, the IMU alone was at most 2.3 % off
 _MIN_COMMON = 5  # keyframes
 _MIN_SIZE_M = 0.05
-_SUFFICIENT_SIGMA = 0.01  # of the scale by the IMU
+_SUFFICIENT_SIGMA = 0.01  # of the scale by the IMU alone, as a share: agreement with it ends the test
 _MAX_COMPARISONS = 8  # each takes as long as an initialisation
 
 
 def alone(camera_tracks: Mapping[int, CameraTracks]) -> dict[int, CameraTracks]:
-    """Return what each camera sees by itself."""
+    """Return the tracks of each camera by itself: without matches in other cameras, and points handed over."""
     return {j: CameraTracks(tracks.ids, tracks.rays, readout=tracks.readout) for j, tracks in camera_tracks.items()}
 
 
 class OverlapTrust:
-    """Finds the scale without overlaps beside the estimate that uses them, and compares.
+    """Finds the scale without overlapping views beside the estimate that uses them, and compares the two.
 
     Args:
-        initialiser: without anything in it.
+        initialiser: an initialiser without keyframes.
     """
 
     def __init__(self, initialiser: Initialiser) -> None:
@@ -46,23 +46,23 @@ class OverlapTrust:
         return None if self._initialiser is None else self._initialiser.oldest_ns
 
     def set_gyro_bias_prior(self, gyro_bias: np.ndarray, sigma: float) -> None:
-        """Set the gyro's bias (3,) rad/s as a standstill shows it."""
+        """Set the prior of the gyro's bias, (3,) rad/s as measured at a standstill, and its standard deviation."""
         if self._initialiser is not None:
             self._initialiser.set_gyro_bias_prior(gyro_bias, sigma)
 
     def add(
         self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool, states: States | None
     ) -> tuple[KeyframeWindow, str] | None:
-        """Add a keyframe.
+        """Add a keyframe, and compare the scales once both are known.
 
         Args:
-            stamp_ns: of the keyframe.
-            camera_tracks: of all cameras.
+            stamp_ns: stamp of the keyframe.
+            camera_tracks: tracks of all cameras.
             is_stationary: whether the rig stands.
-            states: of the window that uses overlaps, or None as long as it does not know the scale.
+            states: states of the window that uses overlapping views, or None as long as that does not know the scale.
 
         Returns:
-            The window without overlaps and what is wrong with these, where they cannot be trusted.
+            The window without overlapping views and what is wrong with these, where they cannot be trusted; else None.
         """
         if self._initialiser is None:
             return None

@@ -1,4 +1,4 @@
-"""Where the points of a window are, seen from its newest state, with joint covariances of states and landmarks."""
+"""Positions of a window's points, seen from its newest state, with joint covariances of states and landmarks."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Solved(NamedTuple):
     """A window as it was solved last.
 
     Attributes:
-        adjusted: states and landmarks.
+        adjusted: adjusted states and landmarks.
         ids: (L,) identities of the landmarks.
-        newest: what is seen from the newest state.
+        newest: views from the newest state.
     """
 
     adjusted: Adjusted
@@ -31,7 +31,7 @@ class Solved(NamedTuple):
 
 
 def covariance_since(solved: Solved, then_ns: int) -> Float | None:
-    """Return the covariance (6, 6) of the motion since a state, in body at the newest one; None where it has left."""
+    """Return the covariance (6, 6) of the motion since a state, in the newest body frame; None where it has left."""
     states = solved.adjusted.states
     found, n = np.flatnonzero(states.stamps_ns == then_ns), len(states.poses)
     if not len(found) or found[0] == n - 1:
@@ -44,10 +44,10 @@ def covariance_since(solved: Solved, then_ns: int) -> Float | None:
 
 
 def located_points(solved: Solved) -> dict[int, LocatedPoints]:
-    """Return the tracks of each camera whose inverse depth exceeds three standard deviations.
+    """Return the points of each camera's tracks whose inverse depth exceeds three standard deviations.
 
-    Covariances are of the points in body at the newest state: what is not known of the scale and of the motion between
-    the states is in them.
+    Covariances are of the points in the body frame of the newest state: they include the uncertainty of the scale, and
+    of the motion between the states.
     """
     newest = solved.newest
     own = np.flatnonzero(newest.camera == newest.owner)
@@ -68,8 +68,8 @@ def located_points(solved: Solved) -> dict[int, LocatedPoints]:
 def _in_body(solved: Solved, rows: Int) -> tuple[Float, Float, Bool]:
     """Return points (K, 3) and covariances (K, 3, 3) of those landmarks (M,) whose depth is known, and which these are.
 
-    With poses and cameras x, a landmark is ``l - V^-1 (b + W^T x)``: its covariance is that for given ones, ``V^-1``,
-    and what theirs adds.
+    After a change x of poses and cameras, a landmark is ``l - V^-1 (b + W^T x)``. Its covariance is that for known
+    poses and cameras, ``V^-1``, plus what the covariance of x adds.
     """
     states, landmarks, measured, at = solved.adjusted
     structure = measured.structure

@@ -1,7 +1,4 @@
-"""Reprojection error of one view of a landmark by a single camera, and its derivatives.
-
-These are with respect to pose, camera and landmark.
-"""
+"""Reprojection error of one view of a landmark by a single camera, with derivatives by pose, camera and landmark."""
 
 from typing import NamedTuple
 
@@ -26,16 +23,17 @@ COLUMNS = POINT_AT + 3
 
 
 class Cameras(NamedTuple):
-    """C cameras as kernels take them, and how they differ from the rig file.
+    """Arrays of C cameras for kernels, with their difference from the rig file.
 
     Attributes:
-        body_T_cam: (C, 4, 4) with the difference.
+        body_T_cam: (C, 4, 4) poses of the cameras in body, including the difference.
         focal_px: (C,) pixels per normalised image unit.
         models: (C,) numbers of the camera models.
         intrinsics: (C, 4) ``[fx, fy, cx, cy]`` of the rig file, by which pixels became rays.
-        distortion: (C, 8) of the rig file, likewise.
+        distortion: (C, 8) coefficients of the rig file, likewise.
         lenses: (C, 9) difference of intrinsics and distortion from these.
-        turns: (C, 3, 3) by which the difference of a camera's rotation vector turns it in body, to first order.
+        turns: (C, 3, 3) derivatives of the cameras' rotation in body with respect to the rotation vector of its
+            difference.
     """
 
     body_T_cam: Float
@@ -61,7 +59,7 @@ class Cameras(NamedTuple):
         )
 
     def moved(self, difference: Float) -> "Cameras":
-        """Return the cameras that differ from these, of the rig file, by a vector (C * SINGLE,)."""
+        """Return cameras that differ by a vector (C * SINGLE,) from these, which have to be those of the rig file."""
         each, body_T_cam = difference.reshape(-1, SINGLE), self.body_T_cam.copy()
         turns = np.array([so3_left_jacobian(place[:3].copy()) for place in each[:, PLACE:]])
         for pose, place in zip(body_T_cam, each[:, PLACE:], strict=True):
@@ -72,7 +70,7 @@ class Cameras(NamedTuple):
 
 @kernel
 def have_moved(cameras: Cameras) -> bool:
-    """Return whether a lens differs from that of the rig file."""
+    """Return whether any lens differs from that of the rig file."""
     for j in range(len(cameras.lenses)):
         for c in range(CAMERA):
             if cameras.lenses[j, c] != 0.0:
@@ -84,8 +82,8 @@ def have_moved(cameras: Cameras) -> bool:
 def _by_lens(cameras: Cameras, j: int, x: float, y: float, out: Float) -> None:
     """Fill the derivatives (2, 9) of a ray with respect to the lens, for a pixel that stays where it was seen.
 
-    They are wanted where a ray is expected. At the ray that was seen, they would go along with its noise: over tens of
-    thousands of views, that is a focal length which is wrong by six standard deviations.
+    They are evaluated at the predicted ray. At the measured ray they would be correlated with its noise: over tens of
+    thousands of views, the focal length would be wrong by six standard deviations.
     """
     distortion, fx, fy = cameras.distortion[j], cameras.intrinsics[j, 0], cameras.intrinsics[j, 1]
     u, v, uu, uv, vu, vv = distort(cameras.models[j], distortion, x, y)
@@ -111,23 +109,24 @@ def whiten_view(
 ) -> bool:  # fmt: skip
     """Fill the rows (2, COLUMNS) of one view: derivatives with respect to pose, camera and landmark, whitened error.
 
-    Coordinates are variables throughout: arrays would be allocated for each view. Where a rolling shutter's line is
-    exposed, the way of the camera since the stamp has no derivatives: over 10 ms, 5 cm/s are half a millimetre.
+    Coordinates are scalar variables throughout, since arrays would be allocated for each view. For a line of a rolling
+    shutter, derivatives of the camera's motion between the stamp and the line's exposure are neglected: over 10 ms, an
+    error of 5 cm/s is half a millimetre.
 
     Args:
         pose: (4, 4) ``odom_T_body``.
-        fall: (2, 3) see `graphvio.monocular.states.States.falls`.
-        cameras: of the rig.
+        fall: (2, 3) motion of body in free fall, see `graphvio.monocular.states.States.falls`.
+        cameras: cameras of the rig.
         j: index of the camera.
-        frame: (4, 4) of the landmark in odom.
-        landmark: (3,).
-        ray: (2,) that was seen, by the lens of the rig file.
-        readout: (4,) when and from where, see `graphvio.measurements.motion.CameraTracks`.
+        frame: (4, 4) frame of the landmark in odom.
+        landmark: (3,) the landmark ``[a, b, w]`` in its frame.
+        ray: (2,) measured normalised coordinates, by the lens of the rig file.
+        readout: (4,) when and from where it was seen, see `graphvio.measurements.motion.CameraTracks`.
         sigma_px: noise of a corner's position.
         of_state: whether derivatives with respect to pose and camera are wanted, too.
-        by_lens: (2, 9) for intermediate results; (0, 9) where the lens is that of the rig file, and no derivatives
-            with respect to the camera are wanted.
-        rows: output.
+        by_lens: (2, 9) for intermediate results; (0, 9) where the lens is that of the rig file, and no derivatives with
+            respect to the camera are wanted.
+        rows: (2, COLUMNS) output.
 
     Returns:
         Whether the landmark is in front of the camera.

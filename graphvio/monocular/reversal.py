@@ -1,7 +1,8 @@
-"""The reverse motion, which views alone cannot distinguish: with all landmarks behind, the flow is the same.
+"""Windows that have found the reverse of the true motion: how they are recognised, and adjusted again.
 
-Where the velocity is uncertain by more than its size, as after a long gap, a window may find the reverse motion. It
-then follows it with great confidence, as accelerations hardly contradict a velocity that is wrong by a constant.
+Views alone cannot distinguish the two: with all landmarks behind the cameras, the optical flow is the same. Where the
+velocity is uncertain by more than its size, as after a long gap, a window may find the reverse motion. Later windows
+then keep it with great confidence, as accelerations hardly contradict a velocity that is wrong by a constant.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH
 from graphvio.monocular.window_prior import Prior
 from graphvio.self_calibration.evidence import Gaussian
 
-_MIN_LANDMARKS = 5  # in view
+_MIN_LANDMARKS = 5  # landmarks that the newest state sees
 _BEHIND = -0.03  # 1/m, a median inverse depth that is not the noise of far landmarks
-_HELD_INFORMATION = 100.0  # of an inverse depth, known to 0.1 / m
+_HELD_INFORMATION = 100.0  # of the prior inverse depth: sigma 0.1 / m
 _STEPS = 10
 
 
@@ -37,7 +38,7 @@ def adjust_forwards(
 ) -> Adjusted:
     """Adjust a window first with its landmarks held in front of their cameras, and then with free ones.
 
-    For arguments see `graphvio.monocular.adjustment.adjust`; states and landmarks are those before it found the
+    For arguments see `graphvio.monocular.adjustment.adjust`; states and landmarks are those from before it found the
     reverse motion.
     """
     is_behind = landmarks[:, 2] < 0.0

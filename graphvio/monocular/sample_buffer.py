@@ -1,4 +1,4 @@
-"""IMU samples of the estimator's window, in time order, as far as the newest state needs them."""
+"""Buffer of the IMU samples of the estimator's window, in time order, as far as the newest state needs them."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from graphvio.self_calibration.preintegration import Preintegrated, covering_sam
 
 _MARGIN_NS = 100_000_000
 MAX_TIME_OFFSET_NS = 30_000_000
-"""By which the time offset of a rig file may be wrong."""
+"""Largest error of a rig file's time offset."""
 _MAX_BRIDGED_NS = 5_000_000_000 + MAX_TIME_OFFSET_NS
 
 
 class SampleBuffer:
     """Keeps the samples between the oldest state that is of use and the newest one.
 
-    Where samples are missing for up to 5 s, readings are interpolated, or the newest one is held, and their noise is
-    that of motion that is not measured: the cameras carry the scale on.
+    Gaps of up to 5 s are bridged: readings are interpolated, or the newest one is held, and their noise becomes that of
+    a motion that is not measured. The cameras carry the scale across a gap.
 
     Args:
-        imu: Of the rig.
-        config: Says what a gap is, the factor on the IMU's stated noise, and how a rig may move that is not measured.
+        imu: The rig's IMU.
+        config: Configuration: what a gap is, the factor on the IMU's stated noise, and how a rig may move while that is
+            not measured.
 
     Attributes:
-        time_offset_s: Of the samples' stamps from those of the framesets, as it is estimated.
+        time_offset_s: Estimated offset of the samples' stamps from those of the framesets.
     """
 
     def __init__(self, imu: Imu, config: Config) -> None:
@@ -47,9 +48,10 @@ class SampleBuffer:
         self._waiting.append(values)
 
     def collect(self, oldest_ns: int, until_ns: int) -> None:
-        """Use the samples that have come, up to the first one after a stamp; forget those from before another one.
+        """Use the samples that have come, up to the first one after ``until_ns``; forget those before ``oldest_ns``.
 
-        Later ones would change the integration next to the stamp, and results would depend on when they came.
+        Later samples wait: they would change the integration next to the stamp, so that results would depend on when
+        they came.
         """
         stamps, readings = self._stamps_ns, self._readings
         if self._waiting_ns:
@@ -64,15 +66,15 @@ class SampleBuffer:
         self._noise = np.maximum(self._stated_noise, shown_noise(self._stamps_ns, self._readings, self._max_gap_ns))
 
     def covers(self, start_ns: int, end_ns: int, bridges: bool = True) -> bool:
-        """Return whether there are samples between two stamps, but for what can be bridged."""
+        """Return whether there are samples between two stamps without gaps, except for those that can be bridged."""
         samples = self.between(np.array([start_ns, end_ns]), is_offset_known=True, bridges=bridges)
         return covering_samples(samples.stamps_ns, start_ns, end_ns, self.time_offset_s, samples.max_gap_ns)[1] >= 0
 
     def preintegrated(self, start_ns: int, end_ns: int, parameters: Float) -> Preintegrated:
-        """Integrate the samples in use between two stamps, by the IMU's parameters (25,).
+        """Integrate the samples in use between two stamps, with the IMU's parameters (25,).
 
         Raises:
-            MeasurementError: If they do not cover it.
+            MeasurementError: If the samples do not cover the interval.
         """
         samples = self.between(np.array([start_ns, end_ns]), is_offset_known=True)
         return preintegrate(
@@ -84,8 +86,8 @@ class SampleBuffer:
         """Return the samples in use, for the intervals between the stamps (K,) of states.
 
         Args:
-            stamps_ns: (K,).
-            is_offset_known: whether the time offset is taken for known, and stays as it is.
+            stamps_ns: (K,) stamps of the states.
+            is_offset_known: whether the time offset is taken as known, and stays as it is.
             bridges: whether an interval is covered where samples are missing in it.
         """
         stamps, readings = self._extended(is_offset_known)
@@ -104,19 +106,19 @@ class SampleBuffer:
         return self._bridged(samples, is_missing) if is_missing.any() else samples
 
     def _bridged(self, samples: InertialSamples, is_missing: Bool) -> InertialSamples:
-        """Return samples with noise by motion that is not measured in some of the N - 1 steps between them.
+        """Return samples with the noise of unmeasured motion in those of the N - 1 steps between them that are missing.
 
-        Such steps are divided at the states: what is not measured differs from one interval to the next.
+        Such steps are divided at the states, since the unmeasured motion differs from one interval to the next.
         """
         before_ns, states_ns = samples.stamps_ns, samples.keyframes_ns + self._offset_ns
         within = (states_ns > before_ns[0]) & (states_ns < before_ns[-1])
         is_in_gap = is_missing[np.searchsorted(before_ns, states_ns[within]) - 1]
         stamps = np.union1d(before_ns, states_ns[within][is_in_gap])
         readings = np.stack([np.interp(stamps, before_ns, values) for values in samples.readings.T], axis=1)
-        step = np.searchsorted(before_ns, stamps[:-1], side="right") - 1  # of which each is a part
+        step = np.searchsorted(before_ns, stamps[:-1], side="right") - 1  # the step that each part belongs to
         missing = np.flatnonzero(is_missing[step])
         gaps_s, parts_s = 1e-9 * np.diff(before_ns)[step[missing]], 1e-9 * np.diff(stamps)[missing]
-        # The force errs by the acceleration, and the rate by what it changes by until it is measured again.
+        # The force errs by the unmeasured acceleration, the rate by its own change until it is measured again.
         sigmas = self._unmeasured * np.stack([gaps_s, np.ones_like(gaps_s)], axis=1)
         factors = np.ones((len(stamps), 2))
         factors[missing] += parts_s[:, None] * (sigmas / self._noise) ** 2
@@ -127,9 +129,9 @@ class SampleBuffer:
         return round(self.time_offset_s * 1e9)
 
     def _extended(self, is_offset_known: bool = True) -> tuple[Int, Float]:
-        """Return the samples in use; where their time offset is estimated, the newest reading lasts a little longer.
+        """Return the samples in use; unless their time offset is known to be zero, the newest reading is held longer.
 
-        An offset that has just been found may ask for samples that have not come; the next framesets have them.
+        A new estimate of the offset may need samples that have not come yet; they are there at the next framesets.
         """
         is_exact = is_offset_known and self.time_offset_s == 0.0
         if is_exact or not len(self._stamps_ns):

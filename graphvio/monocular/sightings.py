@@ -1,8 +1,8 @@
-"""What single cameras saw at the states of a window, and the landmarks that these tracks are joined to.
+"""Views of the tracks of single cameras from a window's states, and their association with landmarks.
 
-A track is used as a chain of landmarks, each seen from a limited number of keyframes. When the oldest keyframe leaves
-the window, the landmarks that it sees have all their views there, and are eliminated with it: each view counts once.
-Lengths differ from track to track, so that at any time only few tracks begin a landmark.
+A long track becomes a chain of landmarks, each seen from a limited number of keyframes. When the oldest keyframe leaves
+the window, the landmarks that it sees have all their views in the window, and are eliminated with it: each view counts
+once. The limit differs from track to track, so that only few tracks begin a new landmark at the same time.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Structure
 
 _NONE: Int = np.zeros(0, dtype=np.int64)
-_MIX = 2654435761  # of Knuth's multiplicative hash: lengths do not depend on the order of tracks
+_MIX = 2654435761  # multiplier of Knuth's hash: limits do not depend on the order of tracks
 
 
 class Views(NamedTuple):
-    """Tracks seen at one state, joined to landmarks: M of all cameras.
+    """M views from one state in the images of all cameras, each of a track that is associated with a landmark.
 
     Attributes:
-        camera: (M,) index of the camera that sees them.
+        camera: (M,) index of the camera whose image it is.
         owner: (M,) index of the camera whose track it is.
-        ids: (M,) identities of its tracks.
-        landmark: (M,) identities of the landmarks.
+        ids: (M,) identity of the track.
+        landmark: (M,) identity of the landmark.
         rays: (M, 2) normalised coordinates.
-        readout: (M, 4) see `graphvio.measurements.motion.CameraTracks`; zero of global shutters.
+        readout: (M, 4) see `graphvio.measurements.motion.CameraTracks`; zero for global shutters.
         is_adopted: (M,) whether the track follows a point that another camera's track began.
     """
 
@@ -47,13 +47,13 @@ class Views(NamedTuple):
         return self._rows(~np.isin(self.landmark, landmarks))
 
     def without_adopted(self, landmarks: Int, cameras: Int) -> Views:
-        """Return all but adopted tracks' views of some landmarks (K,) in some cameras (K,)."""
+        """Return all views but those by adopted tracks of some landmarks (K,), each in one camera (K,)."""
         width = int(max(self.camera.max(initial=0), cameras.max(initial=0))) + 1
         named = np.isin(self.landmark * width + self.camera, landmarks * width + cameras)
         return self._rows(~(self.is_adopted & named))
 
     def once(self, ranks: Int) -> Views:
-        """Return each camera's view of each landmark once: of several tracks', that with the smallest rank (M,)."""
+        """Return at most one view of each landmark per camera: of several, that with the smallest rank (M,)."""
         order = np.lexsort((self.owner, ranks, self.camera, self.landmark))
         camera, landmark = self.camera[order], self.landmark[order]
         again = np.zeros(len(order), dtype=bool)
@@ -73,11 +73,11 @@ _NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)), GLOBAL_SHUTTER, 
 
 
 class LandmarkIds:
-    """Joins tracks to landmarks: tracks of several cameras that follow one point are one landmark.
+    """Associates tracks with landmarks: tracks of several cameras that follow one point share a landmark.
 
     Args:
-        n_cameras: of the rig.
-        max_keyframes: that see one landmark.
+        n_cameras: number of cameras of the rig.
+        max_keyframes: largest number of keyframes that see one landmark.
     """
 
     def __init__(self, n_cameras: int, max_keyframes: int) -> None:
@@ -85,13 +85,13 @@ class LandmarkIds:
         self._max_keyframes = max_keyframes
         self._points: Int = _NONE  # increasing, see `_points_of`
         self._landmarks: Int = _NONE
-        self._left: Int = _NONE  # keyframes
-        self._cameras: Int = _NONE  # that saw each last
+        self._left: Int = _NONE  # keyframes that may still see each landmark
+        self._cameras: Int = _NONE  # index of the camera that saw each point last
         self._tracks = (_NONE, _NONE, _NONE)  # camera, identity and landmark of the newest tracks
         self._next = 0
 
     def join(self, camera_tracks: Mapping[int, CameraTracks]) -> Views:
-        """Join the tracks of an instant to landmarks; points that have none begin one."""
+        """Associate the tracks of an instant with landmarks; points without a landmark begin a new one."""
         ordered = sorted(camera_tracks.items())
         if not ordered:
             return _NO_VIEWS
@@ -120,11 +120,11 @@ class LandmarkIds:
         return views.once(np.concatenate(ranks))
 
     def note_keyframe(self) -> None:
-        """Record that the newest tracks are those of a keyframe."""
+        """Record that the newest frameset is a keyframe."""
         self._left = self._left - 1
 
     def end(self, landmarks: Int) -> None:
-        """End some landmarks: tracks that go on begin others."""
+        """End some landmarks: tracks that continue begin new ones."""
         self._left = np.where(np.isin(self._landmarks, landmarks), 0, self._left)
 
     def tracks_of(self, landmarks: Int) -> dict[int, Int]:
@@ -134,7 +134,7 @@ class LandmarkIds:
         return {int(j): np.unique(ids[cameras == j]) for j in np.unique(cameras)}
 
     def _points_of(self, camera: int, tracks: CameraTracks) -> Int:
-        """Return numbers (N,) of the points that a camera's tracks follow: of the camera and track that began each."""
+        """Return numbers (N,) of the points that a camera's tracks follow, by the camera and track that began each."""
         points = tracks.ids * self._n_cameras + camera
         rows, cameras, ids = tracks.handed_over
         points[rows] = ids * self._n_cameras + cameras
@@ -144,10 +144,10 @@ class LandmarkIds:
         """Return the landmarks (N,) of tracks, and forget points that the cameras with images no longer see.
 
         Args:
-            of_tracks: (N,) their points.
-            ids: (N,) their identities.
-            cameras: (N,) whose they are.
-            present: the cameras that have images.
+            of_tracks: (N,) numbers of the points that the tracks follow.
+            ids: (N,) identities of the tracks.
+            cameras: (N,) index of the camera that each track belongs to.
+            present: indices of the cameras that have images.
         """
         points, firsts, which = np.unique(of_tracks, return_index=True, return_inverse=True)
         landmarks, left = np.full(len(points), -1, dtype=np.int64), np.zeros(len(points), dtype=np.int64)
@@ -172,7 +172,7 @@ class LandmarkIds:
 
 
 class Landmarks:
-    """Where landmarks are, by their identities."""
+    """Estimated positions of landmarks, by the landmarks' identities."""
 
     def __init__(self) -> None:
         self._ids: Int = np.zeros(0, dtype=np.int64)
@@ -180,12 +180,12 @@ class Landmarks:
         self._frames = np.zeros((0, 4, 4))
 
     def structure(self, views: Sequence[Views], poses: Float, cameras: Cameras) -> tuple[Structure, Float, Int]:
-        """Collect the landmarks that have two views at least, from two states or in two cameras.
+        """Collect the landmarks that have at least two views, from two states or in two cameras.
 
         Args:
-            views: of the K states, in time order.
+            views: views from the K states, in time order.
             poses: (K, 4, 4) ``odom_T_body``.
-            cameras: of the rig.
+            cameras: cameras of the rig.
 
         Returns:
             The structure, the landmarks (L, 3), and their identities (L,).
@@ -215,18 +215,18 @@ class Landmarks:
         return Structure(frames, bounds, state, camera, rays, readout), places, ids
 
     def put(self, ids: Int, frames: Float, places: Float) -> None:
-        """Set new frames (L, 4, 4) of landmarks (L,) that were last collected, and their places (L, 3) there."""
+        """Set frames (L, 4, 4) of landmarks (L,) that were collected last, and their coordinates (L, 3) there."""
         rows = np.searchsorted(self._ids, ids)
         self._frames, self._places = self._frames.copy(), self._places.copy()
         self._frames[rows], self._places[rows] = frames, places
 
     def turn(self, new_T_odom: Float) -> None:
-        """Express the landmarks in another frame."""
+        """Express the landmarks in another frame, given by ``new_T_odom`` (4, 4)."""
         self._frames = new_T_odom @ self._frames
 
 
 def far_off(structure: Structure, errors2: Float, max_error2: float, max_share: float) -> Bool:
-    """Find the landmarks (L,) of which too large a share of the views has a squared whitened error beyond a bound."""
+    """Return which landmarks (L,) have too large a share of views whose squared whitened error exceeds a bound."""
     if not len(structure.odom_T_landmark):
         return np.zeros(0, dtype=bool)
     off = np.add.reduceat(errors2 > max_error2, structure.rows[:-1], dtype=np.int64)

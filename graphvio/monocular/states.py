@@ -1,9 +1,9 @@
-"""States of a window, and where their unknowns are in a window's equations.
+"""States of a window, and the layout of their unknowns in the window's equations.
 
 Unknowns are ``[poses 6 K, velocities 3 K, gravity 3, gyro and accelerometer bias 6, calibration F]`` of K states; the
-landmarks are eliminated. Biases and calibration are the same in the whole window; they walk when a state leaves it. The
-calibration is ``[cameras C * SINGLE, IMU without its biases 19]``, see `graphvio.self_calibration.parameters`: the
-difference from the rig file, which is unknown, or taken for zero.
+landmarks are eliminated. Biases and calibration are the same in the whole window; their random walk is added when a
+state leaves it. The calibration is ``[cameras C * SINGLE, IMU without its biases 19]``, see
+`graphvio.self_calibration.parameters`: the difference from the rig file, which is estimated, or taken as zero.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class States:
         poses: (K, 4, 4) ``odom_T_body``.
         velocities: (K, 3) m/s, frame odom.
         gravity: (3,) m/s^2, frame odom, downwards.
-        biases: (6,) of gyro, rad/s, and accelerometer, m/s^2.
+        biases: (6,) biases of gyro, rad/s, and accelerometer, m/s^2.
         calibration: (F,) difference from the rig file; empty where it is not estimated.
     """
 
@@ -54,12 +54,12 @@ class States:
         return max(len(self.calibration) - _OTHER_IMU, 0)
 
     def cameras(self, of_file: Cameras) -> Cameras:
-        """Return the cameras, from those of the rig file."""
+        """Return the cameras with the states' calibration, from those of the rig file."""
         return of_file.moved(self.calibration[: self.n_camera_parameters]) if self.calibration.any() else of_file
 
     @property
     def falls(self) -> Float:
-        """(K, 2, 3) way of body after t seconds without any force, in body: the coefficients of t and of its square."""
+        """(K, 2, 3) motion of body in free fall for t seconds, in body: the coefficients of t and of its square."""
         falls = np.stack([self.velocities, np.broadcast_to(0.5 * self.gravity, self.velocities.shape)], axis=1)
         return np.ascontiguousarray(falls @ self.poses[:, :3, :3])
 
@@ -100,27 +100,27 @@ class States:
 
 
 def columns_of(n: int, states: Int, n_free: int = 0) -> Int:
-    """Return where ``[poses, velocities, gravity, biases, calibration]`` of some of n states are among all unknowns."""
+    """Return the indices of ``[poses, velocities, gravity, biases, calibration]`` of some of n states among all."""
     poses = (6 * states[:, None] + np.arange(6)).ravel()
     velocities = (6 * n + 3 * states[:, None] + np.arange(3)).ravel()
     return np.concatenate([poses, velocities, 9 * n + np.arange(GRAVITY + BIASES + n_free)])
 
 
 def inertial_columns(n: int, n_camera_parameters: int, n_free: int) -> Int:
-    """Return where the unknowns of `inertial_equations` are; where the calibration is known, of all but its last."""
+    """Return the indices of the unknowns of `inertial_equations`, without its last ones if the calibration is known."""
     known = 9 * n + GRAVITY + BIASES
     return np.concatenate([np.arange(known), np.arange(known + n_camera_parameters, known + n_free)])
 
 
 def visual_columns(n: int, n_camera_parameters: int, n_free: int) -> Int:
-    """Return where the unknowns of `visual_equations` are: poses, and cameras unless the calibration is known."""
+    """Return the indices of the unknowns of `visual_equations`: poses, and cameras unless the calibration is known."""
     known = 9 * n + GRAVITY + BIASES
     return np.concatenate([np.arange(6 * n), known + np.arange(n_camera_parameters if n_free else 0)])
 
 
 @kernel
 def add_block(hessian: Float, columns: Int, block: Float) -> None:
-    """Add to the rows and columns (M,) of a Hessian (N, N) the first M of a block's (M at least, M at least)."""
+    """Add the first M rows and columns of a block to the rows and columns (M,) of a Hessian (N, N)."""
     for r in range(len(columns)):
         for c in range(len(columns)):
             hessian[columns[r], columns[c]] += block[r, c]

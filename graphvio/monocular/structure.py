@@ -1,8 +1,8 @@
-"""Landmarks that single cameras see from the states of a window, and where they are.
+"""Landmarks that single cameras see from the states of a window: their views, and their positions.
 
-A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own, that of the camera which sees
-it first as it was last estimated: `w` is its inverse depth there. Before there is a baseline a wide prior stands for
-`w`. Where views overlap, several cameras see a landmark from one state, and know its distance in metres.
+A landmark is ``[a, b, w]``: the homogeneous point ``[a, b, 1, w]`` in a frame of its own, which is that of the camera
+that sees it first, as it was last estimated. `w` is its inverse depth there; before there is a baseline, a wide prior
+determines it. Where views overlap, several cameras see a landmark from one state, which shows its distance in metres.
 """
 
 from typing import NamedTuple
@@ -25,22 +25,22 @@ from graphvio.self_calibration.moving_landmarks import move_landmark
 from graphvio.self_calibration.parameters import CAMERA
 
 PRIOR_INVERSE_DEPTH = 0.2
-PRIOR_INFORMATION = 1e-2  # of an inverse depth, known to 10 / m: more would pull the scale of all landmarks
+PRIOR_INFORMATION = 1e-2  # of a prior inverse depth, sigma 10 / m: a stronger one would bias the scale of all landmarks
 _STEPS = 6
 _LOCATED = 1e-9  # a smaller step ends the search of a landmark's place: it is less than a millionth of a pixel
-_FEW = 5  # views, of a landmark that is located again before the window is linearised
+_FEW = 5  # views: landmarks with no more are located again before the window is linearised
 
 
 class Structure(NamedTuple):
     """Views of L landmarks from K states: N rows, sorted by landmark.
 
     Attributes:
-        odom_T_landmark: (L, 4, 4) frame of each.
+        odom_T_landmark: (L, 4, 4) frame of each landmark.
         rows: (L + 1,) the views of landmark l are ``rows[l]`` to ``rows[l + 1]``, in the order of states and cameras.
         state: (N,) index of the state.
         camera: (N,) index of the camera.
         rays: (N, 2) normalised coordinates.
-        readout: (N, 4) see `graphvio.measurements.motion.CameraTracks`; zero of global shutters.
+        readout: (N, 4) see `graphvio.measurements.motion.CameraTracks`; zero for global shutters.
     """
 
     odom_T_landmark: Float
@@ -51,20 +51,20 @@ class Structure(NamedTuple):
     readout: Float
 
     def of(self, kept: Bool) -> "Structure":
-        """Return those of the landmarks (L,) that are kept."""
+        """Return the landmarks (L,) that are kept, with their views."""
         rows, begins = rows_of(self.rows, kept)
         rays, readout = np.compress(rows, self.rays, axis=0), np.compress(rows, self.readout, axis=0)
         return Structure(self.odom_T_landmark[kept], begins, self.state[rows], self.camera[rows], rays, readout)
 
 
 class Eliminated(NamedTuple):
-    """What the elimination of the landmarks leaves behind, to find them again.
+    """Terms of the landmarks' elimination, from which the landmarks' own step follows.
 
     Attributes:
-        inverse: (L, 3, 3) of their normal matrices.
-        gradient: (L, 3).
+        inverse: (L, 3, 3) inverse of each landmark's normal matrix.
+        gradient: (L, 3) gradient of the cost with respect to each landmark.
         by_pose: (N, 3, 6) coupling of each view with its state's pose.
-        by_cameras: (L, 3, C * SINGLE) coupling with the cameras' calibration, (L, 3, 0) where that is taken for known.
+        by_cameras: (L, 3, C * SINGLE) coupling with the cameras' calibration, (L, 3, 0) where that is taken as known.
     """
 
     inverse: Float
@@ -91,12 +91,12 @@ def landmarks_after(
 
     Args:
         landmarks: (L, 3) before.
-        structure: of the views.
-        cameras: of the rig, before.
+        structure: views of the landmarks.
+        cameras: cameras of the rig, before.
         poses: (K, 4, 4) ``odom_T_body``, before.
         moved_poses: (K, 4, 4) after.
-        eliminated: what the elimination of the landmarks left behind.
-        step: (6 K + n,) of the poses and of n parameters of cameras.
+        eliminated: terms of the landmarks' elimination.
+        step: (6 K + n,) step of the poses and of n parameters of cameras.
     """
     n_poses = POSE * len(poses)
     moved, frames = np.empty_like(landmarks), structure.odom_T_landmark.copy()
@@ -123,7 +123,7 @@ def located(
     poses: Float, falls: Float, cameras: Cameras, landmarks: Float, structure: Structure, sigma_px: float,
     depth_information: float, everywhere: bool,
 ) -> Float:  # fmt: skip
-    """Return the landmarks (L, 3) with those of few views, or all, located again for poses that stay."""
+    """Return the landmarks (L, 3), with those of few views (all if ``everywhere``) optimised again for fixed poses."""
     moved, rows = landmarks.copy(), np.zeros((2, COLUMNS))
     v, inverse, bl = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     by_lens = np.zeros((2 if have_moved(cameras) else 0, CAMERA))

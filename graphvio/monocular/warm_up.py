@@ -1,4 +1,4 @@
-"""Kernels of single cameras, compiled or loaded before the first image."""
+"""Warm-up of the kernels of single cameras: they are compiled or loaded before the first image."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graphvio.self_calibration.prior import file_prior
 
 
 def warm_up_keyframe_window(rig: Rig) -> None:
-    """Call the kernels of the window, and of its calibration, without landmarks: they are then compiled or loaded."""
+    """Call the kernels of the window and of its calibration, with one landmark, so that they are compiled or loaded."""
     second = 1_000_000_000
     stamps = np.arange(-second // 10, second, 5_000_000)
     readings = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2], (len(stamps), 1))

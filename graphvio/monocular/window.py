@@ -14,21 +14,21 @@ from graphvio.monocular.states import States
 from graphvio.monocular.window_prior import Prior
 
 MAX_KEYFRAMES = 14
-MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still
+MAX_ERROR2 = 16.0  # squared whitened error of a view of a landmark that stands still
 MAX_OFF = 0.3  # share of a landmark's views that may be farther off
 
 
 @dataclass(eq=False)
 class KeyframeWindow:
-    """States of a window with what was seen from them.
+    """States of a window, with the views from them.
 
     Attributes:
-        states: in time order.
-        views: of each.
-        stationary: whether the rig stood there.
-        landmark_ids: joins tracks to landmarks.
-        landmarks: where these are.
-        prior: what is known from before.
+        states: states, in time order.
+        views: views from each state.
+        stationary: whether the rig stood at each state.
+        landmark_ids: associates tracks with landmarks.
+        landmarks: positions of the landmarks.
+        prior: prior of the states from before the window, or None.
         factors: (G,) by which the rig file's errors exceed its standard deviations.
     """
 
@@ -44,10 +44,10 @@ class KeyframeWindow:
         """Add a predicted state: after the newest one, or instead of it where that is no keyframe.
 
         Args:
-            stamp_ns: of its frameset.
+            stamp_ns: stamp of its frameset.
             pose: ``nav_T_body`` (4, 4).
             velocity: (3,) m/s in nav.
-            instead: whether the newest state leaves.
+            instead: whether it replaces the newest state.
         """
         states = self.states
         n = len(states.poses) - 1 if instead and len(states.poses) > 1 else len(states.poses)
@@ -60,7 +60,7 @@ class KeyframeWindow:
         )
 
     def add_views(self, camera_tracks: Mapping[int, CameraTracks], is_stationary: bool) -> None:
-        """Add what the cameras see from the newest state: camera -> tracks."""
+        """Add the views from the newest state: index of the camera -> tracks."""
         self.views.append(self.landmark_ids.join(camera_tracks))
         self.stationary.append(is_stationary)
 

@@ -1,11 +1,11 @@
-"""What is known from before a window: of its first states, of gravity, of the biases, and of the calibration.
+"""Prior of a window by earlier measurements: of its first states, gravity, the biases and the calibration.
 
-A prior stays as it was linearised, with errors in metres. Those of what cameras see get smaller with the scale, while
-errors in pixels do not: each correction of a pose would make a smaller scale likelier, and a scale that vision does not
-know would shrink with time. So states are compared at the same size of the window, and the size by itself, by its
-logarithm, as differences in Sim(3) are (H. Strasdat, J. Montiel, A. Davison, *Scale Drift-Aware Large Scale Monocular
-SLAM*, RSS 2010). To first order that is the plain difference; between windows that differ in their scale only, it is
-exact.
+A prior stays as it was linearised, with errors in metres. Errors of views that were turned into metres get smaller with
+the scale, while errors in pixels do not: each correction of a pose would make a smaller scale likelier, and a scale
+that vision does not observe would shrink with time. States are therefore compared at the same size of the window, and
+the logarithm of the size is compared separately, as differences in Sim(3) are (H. Strasdat, J. Montiel, A. Davison,
+*Scale Drift-Aware Large Scale Monocular SLAM*, RSS 2010). To first order that is the plain difference; between windows
+that differ in their scale only, it is exact.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graphvio.kernels import kernel
 from graphvio.linear_algebra import times, turn_rows
 from graphvio.monocular.states import States, add_block, columns_of
 
-_STANDSTILL_M = 0.05  # rms size of a window that is as good as at a point, and has no scale
+_STANDSTILL_M = 0.05  # rms size of a window that practically stands at a point, and has no scale
 
 
 class Difference(NamedTuple):
@@ -29,9 +29,9 @@ class Difference(NamedTuple):
 
     Attributes:
         off: (N,) the difference.
-        scaled: (N,) derivative of each unknown with respect to its own perturbation, in the axes of before.
-        away: (N,) of the states at the same size.
-        by_size: (N,) derivative of the size's logarithm.
+        scaled: (N,) derivative of each unknown with respect to its own perturbation, in the axes at the linearisation.
+        away: (N,) difference of the states at the same size of the window.
+        by_size: (N,) derivative of the logarithm of the size.
     """
 
     off: Float
@@ -41,12 +41,12 @@ class Difference(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What is known of the first states of a window, of gravity, of the biases, and by them of the calibration.
+    """Quadratic cost of the first m states of a window, gravity, the biases and F parameters of the calibration.
 
     Attributes:
         at: the m states at which it was linearised.
-        information: (9 m + 9 + F, 9 m + 9 + F).
-        gradient: (9 m + 9 + F,) of the cost at these.
+        information: (9 m + 9 + F, 9 m + 9 + F), in the order of `columns_of`.
+        gradient: (9 m + 9 + F,) gradient of the cost at these states.
     """
 
     at: States
@@ -54,7 +54,7 @@ class Prior(NamedTuple):
     gradient: Float
 
     def difference(self, states: States) -> Difference:
-        """Return the difference of the same states, as they are now, from those at which it was linearised."""
+        """Return the difference of the current values of the same states from those at the linearisation."""
         then, off = self.at, states.since(self.at)
         scaled, away, by_size = np.ones(len(off)), np.zeros(len(off)), np.zeros(len(off))
         _at_same_size(then.poses, then.velocities, states.poses, states.velocities, off, scaled, away, by_size)
@@ -62,18 +62,18 @@ class Prior(NamedTuple):
 
 
 def first_prior(states: States, bias_sigmas: Float, biases: Float, pose_sigmas: Float) -> Prior:
-    """Return what is known of a window's first state: its pose defines the frame; and of the biases."""
+    """Return the prior of a first window: of its first pose, which defines the frame, and of the biases."""
     first, calibration = replace(states.of(np.arange(1)), biases=biases), np.zeros(len(states.calibration))
     information = np.diag(np.concatenate([1.0 / pose_sigmas**2, np.zeros(6), 1.0 / bias_sigmas**2, calibration]))
     return Prior(first, information, np.zeros(len(information)))
 
 
 def add_prior(prior: Prior, states: States, n_free: int, hessian: Float, gradient: Float) -> float:
-    """Add what is known from before a window to its equations, and return its cost.
+    """Add the prior from before a window to its equations, and return its cost.
 
     Args:
-        prior: of the first states.
-        states: all of the window, at which the equations are.
+        prior: prior of the first states.
+        states: all states of the window, at which the equations are linearised.
         n_free: number of the calibration's parameters that are unknown, F or 0.
         hessian: is added to.
         gradient: is added to.
@@ -94,15 +94,15 @@ def _at_same_size(
     then_poses: Float, then_velocities: Float, poses: Float, velocities: Float, off: Float, scaled: Float,
     away: Float, by_size: Float,
 ) -> None:  # fmt: skip
-    """Fill where positions and velocities differ at the same size of the window, and how its size differs.
+    """Fill the difference of positions and velocities at the same size of the window, and that of its size.
 
-    A path grows with its scale from the origin: there the epoch began.
+    A trajectory grows with its scale from the origin, where the epoch began.
 
     Args:
-        then_poses: (K, 4, 4) of a prior.
-        then_velocities: (K, 3).
-        poses: (K, 4, 4).
-        velocities: (K, 3).
+        then_poses: (K, 4, 4) poses of the prior.
+        then_velocities: (K, 3) velocities of the prior.
+        poses: (K, 4, 4) current poses.
+        velocities: (K, 3) current velocities.
         off: output, see `Difference`, as the next ones.
         scaled: output.
         away: output.
@@ -159,14 +159,15 @@ def _of_plain_differences(information: Float, gradient: Float, difference: Diffe
 def of_perturbations(information: Float, gradient: Float, poses: Float, before: Float) -> tuple[Float, Float]:
     """Return the information and gradient of perturbed poses, from those of their differences as by `States.since`.
 
-    A perturbation is in the body's axes as they are now, and a difference in those of before. Where the two are taken
-    for the same, a prior pretends to know where the whole window is, and which way it faces, once poses have turned.
+    A perturbation is in the current axes of body, and a difference in those at the linearisation. If the two were taken
+    as the same, a prior would gain false information about the whole window's position and heading once poses have
+    turned.
 
     Args:
-        information: (N, N) of all unknowns, the poses first.
-        gradient: (N,).
-        poses: (K, 4, 4) that are perturbed.
-        before: (K, 4, 4) from which the differences are.
+        information: (N, N) information of all unknowns, the poses first.
+        gradient: (N,) gradient, likewise.
+        poses: (K, 4, 4) poses that are perturbed.
+        before: (K, 4, 4) poses at the linearisation, from which the differences are.
     """
     changed, total = information.copy(), gradient.copy().reshape(-1, 1)
     for k in range(len(poses)):

@@ -1,6 +1,7 @@
-"""Fixed-lag smoothing of a rig of single cameras: a window is solved at each frameset, and its oldest keyframe leaves.
+"""Fixed-lag smoother of a rig of single cameras: a window is solved at each frameset, and its oldest keyframe leaves.
 
-What leaves is marginalised, and stays as a prior on the states that have seen the same landmarks.
+The oldest keyframe is marginalised together with the landmarks that it sees, which leaves a prior on the states that
+have seen the same landmarks.
 """
 
 from __future__ import annotations
@@ -31,24 +32,24 @@ from graphvio.self_calibration.pixel_noise import pixel_noise
 
 FIRST_MONOCULAR_SIGMA_PX = 0.3
 _MAX_SIGMA_PX = 0.6
-_NOISE_GAIN = 0.1  # of one keyframe
+_NOISE_GAIN = 0.1  # share by which one keyframe corrects the estimated pixel noise
 _STEPS, _KEYFRAME_STEPS, _RECALIBRATION_STEPS = 2, 3, 10
 _CONVERGED = 0.1  # squared distance from the solution, in standard deviations; the next frameset goes on from there
 _MAX_EXCESS_COST = 1.0  # by which landmarks in front may fit worse than behind: views alone cannot distinguish them
-_MIN_LANDMARKS = 8  # that constrain the newest state
+_MIN_LANDMARKS = 8  # landmarks that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
 _POSE_AND_GRAVITY = np.r_[0:6, 9:12]
 NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
 
 
 class Solution(NamedTuple):
-    """What a frameset's solution says.
+    """Result of solving the window at a frameset.
 
     Attributes:
         imu_errors2: squared whitened errors of the IMU between the states.
         is_tracking: whether enough landmarks constrain the newest state.
-        dropped: index of the camera -> tracks that do not stand still.
-        is_possible: whether sensors may have such a calibration.
+        dropped: index of the camera -> identities of tracks that do not stand still.
+        is_possible: whether real sensors may have the estimated calibration.
     """
 
     imu_errors2: Float
@@ -58,17 +59,17 @@ class Solution(NamedTuple):
 
 
 class WindowSolver:
-    """Solver of a rig's windows, one after the other.
+    """Solves the windows of a rig, one after the other.
 
     Args:
-        cameras: of the rig.
-        calibration: of the rig, with what is known of it.
-        samples: of the IMU.
+        cameras: cameras of the rig file.
+        calibration: calibration of the rig, with what is known of it.
+        samples: buffer of the IMU samples.
 
     Attributes:
-        calibration: as above; another one may be used from the next window on.
+        calibration: as above; it may be replaced, for the next window.
         samples: as above; likewise.
-        covariance: of the newest state.
+        covariance: covariance of the newest state.
         first_pose_ns: stamp of the window's first pose, 0 before the first window.
     """
 
@@ -88,7 +89,7 @@ class WindowSolver:
     # ------------------------------------------------------------------ what is known
 
     def covariance_since(self, then_ns: int) -> Float | None:
-        """Return the covariance (6, 6) of the motion since a keyframe of the window, in body at the newest state."""
+        """Return the covariance (6, 6) of the motion since a keyframe of the window, in the newest body frame."""
         return None if self._solved is None else covariance_since(self._solved, then_ns)
 
     def located_points(self) -> dict[int, LocatedPoints]:
@@ -101,27 +102,27 @@ class WindowSolver:
         return taken
 
     def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
-        """Hand over the views of each landmark once, when it leaves the window, or the window ends."""
+        """Register a function that gets the views of each landmark once, as it leaves the window or the window ends."""
         self._on_views = on_views
 
     # ------------------------------------------------------------------ one window
 
     def begin(self, window: KeyframeWindow, stamp_ns: int) -> None:
-        """Begin with the window of an epoch's first pose, at a frameset."""
+        """Begin an epoch with its first window, at the frameset of its first pose."""
         self.first_pose_ns = stamp_ns
         self.calibration.begin(window.factors)
         self._first_time_offset_s = self.samples.time_offset_s
 
     def solve(self, window: KeyframeWindow, stamp_ns: int, is_keyframe: bool) -> Solution:
-        """Solve for the states and landmarks, and leave out what does not stand still.
+        """Solve for the states and landmarks, and leave out landmarks that do not stand still.
 
         Args:
-            window: with the newest state and what is seen from it.
-            stamp_ns: of the newest state.
-            is_keyframe: whether it stays.
+            window: window with the newest state and the views from it.
+            stamp_ns: stamp of the newest state.
+            is_keyframe: whether the newest state is a keyframe, and stays.
 
         Raises:
-            numpy.linalg.LinAlgError: if the measurements do not determine them.
+            numpy.linalg.LinAlgError: if the measurements do not determine the states and landmarks.
         """
         calibration, held = self.calibration, self._held_landmarks(window, is_keyframe)
         adjusted, ids = self._adjusted(window, held, _KEYFRAME_STEPS if is_keyframe else _STEPS)
@@ -147,7 +148,7 @@ class WindowSolver:
         return Solution(adjusted.equations.imu_errors2, is_tracking, dropped, is_possible)
 
     def end(self, window: KeyframeWindow) -> None:
-        """Declare all poses of the window final, and hand its landmarks over."""
+        """Declare all poses of the window final, and hand over the views of its landmarks."""
         if self._on_views is not None:
             while window.states.stamps_ns[0] < self.first_pose_ns:
                 self._forget_first(window)
@@ -158,18 +159,18 @@ class WindowSolver:
         self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
 
     def discard(self) -> None:
-        """Take back what an epoch's windows have shown of the calibration: none explains them."""
+        """Discard what the epoch's windows have shown of the calibration: no calibration explains them."""
         self.calibration.discard()
         self.samples.time_offset_s = self._first_time_offset_s
 
     def forget(self) -> None:
-        """Forget what the last window said of the newest state."""
+        """Forget the last solution, with the covariance of its newest state."""
         self._solved, self._held, self.covariance = None, None, NO_COVARIANCE
 
     # ------------------------------------------------------------------ parts of these steps
 
     def _adjusted(self, window: KeyframeWindow, held: HeldLandmarks | None, max_steps: int) -> tuple[Adjusted, Int]:
-        """Adjust a window by all landmarks but those that are held, and return the identities (L,) of these others."""
+        """Adjust a window by all landmarks but the held ones; return also the identities (L,) of those used."""
         structure, places, ids = self._structure(window)
         prior = window.prior
         if held is not None:
@@ -199,14 +200,14 @@ class WindowSolver:
     def _held_landmarks(self, window: KeyframeWindow, is_keyframe: bool) -> HeldLandmarks | None:
         """Return the landmarks that are held since the newest keyframe, or None where they have to be solved for.
 
-        They are linearised at the first frameset after the keyframe, and not at all where that is one, too.
+        They are linearised at the first frameset after the keyframe, unless that frameset is a keyframe, too.
         """
         if self._held is None and not is_keyframe:
             self._held = self._hold(window.without_newest())
         return self._held if self._held is not None and self._held.holds(window) else None
 
     def _hold(self, window: KeyframeWindow) -> HeldLandmarks:
-        """Linearise what a keyframe's window knows by landmarks that the keyframe does not see."""
+        """Linearise the views of those landmarks of a keyframe's window that the keyframe does not see."""
         structure, places, ids = self._structure(window)
         held = ~np.isin(ids, window.views[-1].landmark)
         ids, places, measured = ids[held], places[held], self._measured(window, structure.of(held))
@@ -215,7 +216,12 @@ class WindowSolver:
         return HeldLandmarks(ids, measured, places, prior, eliminated)
 
     def _leave_out_moving(self, window: KeyframeWindow, adjusted: Adjusted, ids: Int) -> tuple[bool, Mapping[int, Int]]:
-        """End landmarks that do not stand still: whether enough others are seen, and which tracks these were."""
+        """End landmarks that do not stand still.
+
+        Returns:
+            Whether enough other landmarks are seen, and the tracks of the ended ones: index of the camera ->
+            identities.
+        """
         structure, errors2 = adjusted.measured.structure, adjusted.equations.errors2
         off = far_off(structure, errors2, MAX_ERROR2, MAX_OFF)
         seen = np.isin(ids, window.views[-1].landmark)
@@ -228,7 +234,7 @@ class WindowSolver:
         return is_tracking, dropped
 
     def _finish_keyframe(self, window: KeyframeWindow, adjusted: Adjusted) -> None:
-        """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
+        """Let the oldest keyframe leave where the window is full, and update the estimate of the pixel noise."""
         window.landmark_ids.note_keyframe()
         if len(adjusted.equations.errors2):
             wanted = min(pixel_noise(adjusted.equations.errors2, self._sigma_px), _MAX_SIGMA_PX)
@@ -256,7 +262,7 @@ class WindowSolver:
             self._on_views(first_window(window.prior))
 
     def _hand_over(self, structure: Structure, states: States, places: Float) -> None:
-        """Hand over the views of some landmarks (L, 3), which no window will use again."""
+        """Hand over the views of some landmarks (L, 3), which no later window will use."""
         if self._on_views is None or not len(places):
             return
         information, gradient = views_only(states.cameras(self._cameras), structure, self._sigma_px, states, places)
@@ -294,7 +300,7 @@ def _newest_covariance(adjusted: Adjusted) -> StateCovariance:
 
 
 def _leave_out_mismatches(window: KeyframeWindow, structure: Structure, ids: Int, errors2: Float) -> None:
-    """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
+    """Leave out newest views of adopted tracks that do not fit their landmark; these tracks begin one of their own."""
     rows = np.flatnonzero((structure.state == len(window.views) - 1) & (errors2 > MAX_ERROR2))
     if not len(rows):
         return

@@ -1,17 +1,20 @@
-"""The odometry: measurements of the sensors in, estimates out.
+"""The odometry, which turns measurements of the sensors into estimates.
 
-`odometry` is the recipe, a frameset at a time; `step` is what its listeners get, and `assembly` puts estimates
-together.
+`odometry` has the main loop, which processes one frameset at a time; `step` has the data that its subscribers receive,
+and `assembly` puts estimates together.
 
-*The IMU.* `synchroniser` holds framesets until the IMU covers them (`spike_filter`, `stamp_jitter`). `frameset_imu` is
-the IMU around a frameset, and watches it: `imu_watch` leaves it out while it contradicts vision (pairs), `clock_watch`
-and `imu_clock` find its clock off (single cameras). `group_clocks` and `time_offset_correction` correct the stamps.
+*The IMU.* `synchroniser` holds framesets until the IMU covers them (`spike_filter`, `stamp_jitter`). `frameset_imu`
+provides the IMU readings around a frameset, and monitors the IMU: `imu_watch` leaves it out while it contradicts vision
+(pairs), and `clock_watch` finds an error of its clock (single cameras), which `imu_clock` corrects. `group_clocks` and
+`time_offset_correction` correct the stamps.
 
-*The calibration.* `online_calibration` is what it does for the odometry: nothing (`fixed_calibration`), or it is
-estimated for pairs (`pairs_calibration`) or single cameras (`singles_calibration`); the innovation test allows for its
-errors (`calibration_innovation_covariance`). `recorded_calibration` calibrates from a whole recording.
+*The calibration.* `online_calibration` is the interface of a calibration during the run: it is fixed
+(`fixed_calibration`), or estimated for pairs (`pairs_calibration`) or single cameras (`singles_calibration`); the
+innovation test allows for its errors (`calibration_innovation_covariance`). `recorded_calibration` calibrates from a
+whole recording.
 
-*Reports.* `vision_events` and `rig_mistakes` say what is wrong, `angular_rates` and `nav_frame` serve the estimates.
+*Reports.* `vision_events` and `rig_mistakes` report what is wrong with images and rig; `angular_rates` and `nav_frame`
+convert values for the estimates.
 """
 
 from graphvio.odometry.odometry import Odometry

@@ -9,7 +9,7 @@ from graphvio.measurements.motion import RelativeMotion
 
 
 class AngularRates:
-    """Converts successive motions, which may share a reference, into rates over the newest interval."""
+    """Converts successive motions, which may share a reference, into angular rates over the newest interval."""
 
     def __init__(self) -> None:
         self._before: RelativeMotion | None = None
@@ -21,9 +21,9 @@ class AngularRates:
 
         Args:
             motion: measured motion that ends in the newest frameset, or None.
-            interval: the IMU since the frameset before, or None.
+            interval: the IMU readings since the previous frameset, or None.
             gyro_bias: (3,) rad/s.
-            fused: (3,) rad/s by the state estimator, or None.
+            fused: (3,) rate by the state estimator, rad/s, or None.
         """
         rates: dict[str, Float] = {}
         if interval is not None:

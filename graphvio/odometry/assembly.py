@@ -1,4 +1,4 @@
-"""Estimates, keyframe data and views for the calibration, put together from what the stages return."""
+"""Functions that assemble estimates, keyframe data and views for the calibration from the stages' results."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def estimate_by_measurements(
     time_offset: TimeOffsetCorrection,
     stage_ms: Mapping[str, float],
 ) -> Estimate:
-    """Return what is estimated of a frameset beside the state, which `with_state` adds.
+    """Return the estimate of a frameset without the state, which `with_state` adds.
 
     Args:
         stamp_ns: Stamp of the frameset.
@@ -73,12 +73,12 @@ def estimate_by_measurements(
 def with_state(
     estimate: Estimate, estimator: StateEstimator, calibration: OnlineCalibration, nav: NavFrame
 ) -> Estimate:
-    """Return an estimate with the state that belongs to it, without a pose where it is lost.
+    """Return an estimate with the estimator's state added, but without a pose where it is lost.
 
     Args:
-        estimate: Of a frameset, by its measurements.
-        estimator: Updated by them.
-        calibration: Knows what its errors add to the covariance of the pose.
+        estimate: Estimate of a frameset by its measurements.
+        estimator: State estimator, updated by these measurements.
+        calibration: Calibration, whose errors add to the covariance of the pose.
         nav: Frame of the estimate.
     """
     calibration_covariance = calibration.pose_covariance(estimator.state().nav_T_body)
@@ -106,7 +106,7 @@ def at_stamp(estimate: Estimate, body_T_stamped: Float) -> Estimate:
     """Return an estimate with the pose at its stamp, where that is not the instant of its images.
 
     Args:
-        estimate: With the state at the instant of the images.
+        estimate: Estimate with the state at the instant of the images.
         body_T_stamped: (4, 4) motion of body from then until the stamp.
     """
     if estimate.nav_T_body is None:
@@ -121,10 +121,10 @@ def keyframe_of(
 
     Args:
         frameset: The newest frameset.
-        frontend: Has tracked it.
-        estimator: Has been updated by it.
-        nav: Frame of the estimates, in which body may have turned since the keyframe before.
-        previous_ns: Stamp of the keyframe before, or None.
+        frontend: Front-end that has tracked the frameset.
+        estimator: State estimator, updated by the frameset.
+        nav: Frame of the estimates, in which body may have turned since the previous keyframe.
+        previous_ns: Stamp of the previous keyframe, or None.
     """
     previous_T_body = covariance = None
     if previous_ns is not None:
@@ -147,7 +147,7 @@ def keyframe_of(
 
 
 def views_at(frontend: TrackingFrontend, stamp_ns: int) -> dict[int, View]:
-    """Return what pairs and single cameras, by their index, see at the newest frameset, if it has this stamp."""
+    """Return the views of pairs and single cameras, by index, at the newest frameset, if it has this stamp."""
     return {
         j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
         for j, frame in frontend.frames_at(stamp_ns).items()

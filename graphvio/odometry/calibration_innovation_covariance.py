@@ -1,4 +1,4 @@
-"""The covariance that errors of the calibration add to an innovation, given how far the state has followed vision."""
+"""The covariance that calibration errors add to an innovation, given the motions that the state has followed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.innovation import InnovationErrors
 from graphvio.self_calibration.parameters import depths_of_pair
 
-_SHARED = 0.9  # of what is added to motions by few points, which the next ones from the same reference have, too
-_MAX_JUMP2 = 25.0  # squared Mahalanobis distance by the covariance of a motion
+_SHARED = 0.9  # share of the covariance added to a partial motion that later ones from its reference have, too
+_MAX_JUMP2 = 25.0  # squared Mahalanobis distance of a motion's change, by its covariance
 
 
 class _Measured(NamedTuple):
-    """A motion, and the pairs that it was measured by."""
+    """A motion, and the pairs that measured it."""
 
     motion: RelativeMotion
     pairs: frozenset[int]
@@ -33,14 +33,14 @@ class _Measured(NamedTuple):
 
 
 class _VelocityError(NamedTuple):
-    """What errors of depths do to the state's velocity: its derivatives (P, 2, 6) and the errors then."""
+    """The effect of depth errors on the state's velocity: its derivatives (P, 2, 6), and the errors at that time."""
 
     by_depths: Float
     errors: InnovationErrors
 
 
 class CalibrationInnovationCovariance:
-    """Adds to motions by vision the covariance by which errors of the calibration make them contradict the IMU.
+    """Adds to motions by vision the covariance by which calibration errors make them contradict the IMU.
 
     The state follows vision, and velocity and biases absorb the effect of the calibration error. An innovation
     therefore contains only the error accumulated since vision last constrained the state, usually one step. It contains
@@ -48,7 +48,7 @@ class CalibrationInnovationCovariance:
     has followed.
 
     Args:
-        rig: To which the covariance of the calibration belongs.
+        rig: The rig whose calibration has the covariance.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -57,21 +57,21 @@ class CalibrationInnovationCovariance:
         self._covariance: Float | None = None
         self._followed_ns = -1  # the newest frameset whose motion passed the test
         self._followed: _Measured | None = None  # that motion
-        self._tested: _Measured | None = None  # the newest one
-        self._followed_velocity: _VelocityError | None = None  # of the state, since that motion
-        self._tested_by: dict[frozenset[int], RelativeMotion] = {}  # the newest one of each set of pairs
+        self._tested: _Measured | None = None  # the newest motion
+        self._followed_velocity: _VelocityError | None = None  # error of the state's velocity since that motion
+        self._tested_by: dict[frozenset[int], RelativeMotion] = {}  # the newest motion of each set of pairs
         self._velocity: Float | None = None  # (6,) of body at the newest frameset
         self._velocities: dict[int, Float | None] = {}
-        """Stamp -> body velocity one frameset earlier: of the newest, the references and the last accepted frameset."""
+        """Stamp -> body velocity one frameset earlier; of the newest, the references and the last accepted frameset."""
 
     def add_frameset(self, stamp_ns: int, estimator: StateEstimator, references: Set[int], covariance: Float) -> None:
-        """Update what the state has followed, by a frameset.
+        """Record whether the state has followed the motion of a frameset.
 
         Args:
-            stamp_ns: Its stamp.
-            estimator: Has been updated by it.
-            references: Stamps of framesets that motions are measured from.
-            covariance: (C, C) of the calibration that the state has followed until then.
+            stamp_ns: Stamp of the frameset.
+            estimator: State estimator, updated by the frameset.
+            references: Stamps of framesets from which motions are measured.
+            covariance: (C, C) covariance of the calibration with which the state has followed motions until then.
         """
         if self._covariance is not covariance:
             self._covariance, self._errors = covariance, InnovationErrors(covariance, self._rig)
@@ -91,7 +91,7 @@ class CalibrationInnovationCovariance:
         self._velocity = _body_velocity(estimator)
 
     def _note_velocity(self, stamp_ns: int, estimator: StateEstimator, errors: InnovationErrors) -> None:
-        """Record what errors of depths do to the velocity, as two motions from the same reference have shown it."""
+        """Record the effect of depth errors on the velocity, from two successive motions from the same reference."""
         before, now = self._followed, self._tested
         if before is None or now is None or not before.has_reference_of(now.motion):
             return
@@ -103,10 +103,10 @@ class CalibrationInnovationCovariance:
         self._followed_velocity = _VelocityError(by_depths, errors)
 
     def recalibrate(self, change: Float) -> bool:
-        """Account for another calibration that motions are measured with from now on.
+        """Account for a new calibration, with which motions are measured from now on.
 
         Args:
-            change: (C,) of the cameras' calibration.
+            change: (C,) change of the cameras' calibration parameters.
 
         Returns:
             Whether motions since the references change by more than their noise: the state cannot follow such a jump.
@@ -124,8 +124,8 @@ class CalibrationInnovationCovariance:
         """Return a frameset's result whose motions have the covariance that the calibration's errors add.
 
         Args:
-            visual: Of the frameset.
-            estimator: Has predicted the state there.
+            visual: The front-end's result for the frameset.
+            estimator: State estimator that has predicted the state at the frameset.
         """
         pairs = frozenset(j for j, report in visual.pairs.items() if report.inliers)
         self._tested = None if visual.motion is None else _Measured(visual.motion, pairs)
@@ -139,13 +139,13 @@ class CalibrationInnovationCovariance:
         )
 
     def _noisier(self, motion: RelativeMotion | None, estimator: StateEstimator) -> RelativeMotion | None:
-        """Return a partial motion with that covariance as noise of its own: the state is not to follow its error."""
+        """Return a partial motion with that covariance added to its own: the state must not follow its error."""
         if motion is None:
             return None
         motion = self._motion_with_covariance(motion, frozenset(motion.pairs), estimator)
         if motion.calibration_covariance is None:
             return motion
-        added = motion.calibration_covariance  # about the same of all motions from this reference
+        added = motion.calibration_covariance  # about the same for all motions from this reference
         return replace(
             motion,
             covariance=motion.covariance + added,
@@ -161,7 +161,7 @@ class CalibrationInnovationCovariance:
         now_T_since = estimator.motion_since(since_ns)
         if now_T_since is None:
             return motion
-        now = self._velocity  # that of the state here would come from the IMU under test
+        now = self._velocity  # the predicted state's velocity would come from the IMU under test
         added = self._errors.covariance(se3_inverse(now_T_since), self._velocities.get(since_ns), now)
         followed = self._followed
         if motion.by_depth_errors is not None:
@@ -175,7 +175,7 @@ class CalibrationInnovationCovariance:
             added = added + self._errors.of_depths(by_depth_errors)
             velocity = self._followed_velocity
             if velocity is not None and (followed is None or not followed.has_reference_of(motion)):
-                # The prediction goes on with a velocity that another calibration, or another reference, has measured.
+                # The prediction uses a velocity that was measured with another calibration, or from another reference.
                 step_s = (motion.stamp_ns - since_ns) * 1e-9
                 added = added + velocity.errors.of_depths(step_s * velocity.by_depths)
         if followed is not None and followed.pairs != pairs:

@@ -1,7 +1,8 @@
-"""Watches whether the IMU of single cameras turns when they do, and corrects its clock where it turns at another time.
+"""A check whether the IMU of single cameras turns when they do; if it turns at another time, its clock is corrected.
 
-Without a pair there is no motion by vision that an IMU could contradict: scale, velocity and gravity come from both
-together, and an IMU of another clock bends the path, or fits no motion. But tracks alone show how a camera turns.
+Without a pair there is no motion by vision that an IMU could contradict: scale, velocity and gravity are estimated from
+both together, and an IMU with a wrong clock distorts the path, or fits no motion. But the rotation of a camera follows
+from its tracks alone.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from graphvio.odometry.imu_clock import MAX_SHIFT_S, ImuClock
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
-_INTERVAL_NS = 90_000_000  # from one step to the next
-_STEP_NS = 190_000_000  # over which a turn is measured; where tracks are too short for that, over less
+_INTERVAL_NS = 90_000_000  # time from one step to the next
+_STEP_NS = 190_000_000  # time over which a turn is measured; less where tracks are too short
 _MAX_STEP_NS = 500_000_000
-_COMPARED = 25  # newest steps
-_JUDGED_WITHOUT_POSE = 10  # of them: nothing is lost where it is only a door that opens
+_COMPARED = 25  # number of newest steps that are compared
+_JUDGED_WITHOUT_POSE = 10  # number of them without a pose: a false alarm, as by an opening door, costs nothing then
 _MAX_DISAGREEMENT = 1.0  # median turn difference over its expected error: 0.1 with a right clock, 0.3 at 8 ms of offset
-_MAX_DISAGREEMENT_AT_FIRST = 0.5  # until there are steps enough to be compared
+_MAX_DISAGREEMENT_AT_FIRST = 0.5  # until there are `_COMPARED` steps
 _MIN_DISAGREEMENT_TO_SEARCH = 0.3  # above this, other clock shifts are tried; before a pose always
 _MAX_DIFFERENCE = 0.4  # largest RateMatch.difference that is accepted; a clock that jumped between the steps gives more
-_CHECK_NS = 250_000_000  # from one comparison to the next
-_SAME_S = 0.005  # of two comparisons
-_MIN_SHIFT_S = 0.015  # that ends an epoch; less is the calibration's
+_CHECK_NS = 250_000_000  # time from one comparison to the next
+_SAME_S = 0.005  # largest difference of the shifts by two comparisons that confirm each other
+_MIN_SHIFT_S = 0.015  # for a correction that ends an epoch; smaller shifts are left to the calibration
 _MIN_SHIFT_WITHOUT_POSE_S = 0.01
 
 
@@ -41,11 +42,11 @@ class ClockWatch:
 
     Args:
         rig: Single cameras and an IMU.
-        clock: Takes corrections.
-        synchroniser: Has the samples, and the time offset as it is estimated.
+        clock: Receives corrections.
+        synchroniser: Has the samples, and the estimated time offset.
 
     Attributes:
-        is_doubted: Whether the gyro turns otherwise than the cameras, so that no pose can be right.
+        is_doubted: Whether the gyro turns differently from the cameras, so that no pose can be right.
     """
 
     def __init__(self, rig: Rig, clock: ImuClock, synchroniser: Synchroniser) -> None:
@@ -56,20 +57,20 @@ class ClockWatch:
         self._clock = clock
         self._synchroniser = synchroniser
         self._steps: deque[VisualStep] = deque(maxlen=_COMPARED)
-        self._seen: deque[tuple[int, Mapping[int, CameraTracks]]] = deque()  # at instants that a step may begin with
-        self._next_ns = 0  # of the next comparison at all shifts
-        self._found_s: float | None = None  # by the last one
+        self._seen: deque[tuple[int, Mapping[int, CameraTracks]]] = deque()  # at stamps at which a step may begin
+        self._next_ns = 0  # stamp of the next comparison at all shifts
+        self._found_s: float | None = None  # shift by the last comparison
 
     def update(self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks], has_pose: bool) -> bool:
-        """Update the comparison of the gyro's turns with those of the cameras, by a frameset.
+        """Update the comparison of the gyro's turns with those of the cameras by a frameset.
 
         Args:
-            stamp_ns: Its stamp.
-            camera_tracks: What the cameras see.
-            has_pose: Whether a correction would end an epoch.
+            stamp_ns: Stamp of the frameset.
+            camera_tracks: Camera index -> its tracks at the frameset.
+            has_pose: Whether there is a pose, so that a correction ends an epoch.
 
         Returns:
-            Whether the clock has been corrected: nothing that the IMU has shown until now holds.
+            Whether the clock has been corrected: whatever was learnt from the IMU until now is then invalid.
         """
         judged = _COMPARED if has_pose else _JUDGED_WITHOUT_POSE
         if not self._add_step(stamp_ns, camera_tracks) or len(self._steps) < judged:
@@ -93,7 +94,7 @@ class ClockWatch:
         return False
 
     def _confirmed_shift_s(self, readings: MeanReadings) -> float | None:
-        """Return the shift at which the gyro turns as the cameras do, if the last comparison has found the same."""
+        """Return the shift at which the gyro turns as the cameras do, if the previous comparison found the same."""
         match = match_rates(self._steps, readings, MAX_SHIFT_S)
         before_s, self._found_s = self._found_s, None
         if match is None or match.difference > _MAX_DIFFERENCE:
@@ -103,16 +104,16 @@ class ClockWatch:
 
     @property
     def _learnt_s(self) -> float:
-        """What the time offset differs by from the rig file, as it is estimated."""
+        """Difference of the estimated time offset from that of the rig file, s."""
         return self._synchroniser.time_offset_s - self._file_offset_s
 
     @property
     def _is_beyond(self) -> bool:
-        """Whether that is more than the estimator's samples reach."""
+        """Whether `_learnt_s` exceeds the range of the estimator's samples."""
         return abs(self._learnt_s) > 1e-9 * MAX_TIME_OFFSET_NS
 
     def _correct(self, stamp_ns: int, shift_s: float) -> bool:
-        """Correct the clock; the time offset that was estimated until now is of the wrong one."""
+        """Correct the clock, and undo the estimated time offset, which belongs to the wrong clock."""
         learnt_s = self._learnt_s
         if not self._clock.correct(stamp_ns, shift_s + learnt_s):
             return False
@@ -122,7 +123,7 @@ class ClockWatch:
         return True
 
     def _add_step(self, stamp_ns: int, camera_tracks: Mapping[int, CameraTracks]) -> bool:
-        """Add the turn over the newest step, if it is due, and return whether there is one."""
+        """Add the turn over the newest step, if one is due, and return whether a turn was added."""
         if self._seen and stamp_ns - self._seen[-1][0] < _INTERVAL_NS:
             return False
         self._seen.append((stamp_ns, camera_tracks))

@@ -1,4 +1,4 @@
-"""The calibration of the rig file, taken as it is."""
+"""A calibration that keeps the values of the rig file."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from graphvio.self_calibration.findings import Finding
 
 
 class FixedCalibration:
-    """An `OnlineCalibration` that estimates nothing, and allows for no errors."""
+    """An `OnlineCalibration` that estimates nothing, and assumes no calibration errors."""
 
     @property
     def estimate(self) -> None:
-        """Nothing."""
+        """None, as nothing is estimated."""
 
     @property
     def findings(self) -> list[Finding]:
-        """None."""
+        """An empty list."""
         return []
 
     @property
     def warnings(self) -> list[str]:
-        """None."""
+        """An empty list."""
         return []
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Collect no windows."""
+        """Do nothing: there are no windows."""
 
     def add_sample(self, sample: ImuSample) -> None:
         """Ignore the sample."""
@@ -41,14 +41,14 @@ class FixedCalibration:
         """Do nothing: there are no windows with samples."""
 
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
-        """Return what vision measured, as it is."""
+        """Return the front-end's result unchanged."""
         return visual
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
         """Ignore the frameset."""
 
     def update(self, stamp_ns: int) -> None:
-        """Change nothing."""
+        """Do nothing: the calibration does not change."""
 
     def correct_pose(self, turned: Float) -> None:
         """Do nothing: no pose is changed."""
@@ -58,4 +58,4 @@ class FixedCalibration:
         return np.zeros((6, 6))
 
     def close(self) -> None:
-        """Do nothing: nothing runs."""
+        """Do nothing: nothing runs beside the odometry."""

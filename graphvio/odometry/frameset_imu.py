@@ -1,4 +1,4 @@
-"""The IMU around a frameset: whether it is awaited, the interval before, a standstill, the motion of a readout."""
+"""IMU readings around a frameset: the interval before it, a standstill, the motion during the readout of its images."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from graphvio.odometry.imu_watch import ImuWatch
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
-_MAX_VELOCITY_SIGMA_M_S = 0.1  # beyond, images measure it better
+_MAX_VELOCITY_SIGMA_M_S = 0.1  # above this, images measure the velocity better
 
 
 class FramesetImu:
-    """The samples of a synchroniser, as an odometry uses them at each frameset.
+    """Provides the IMU readings of a synchroniser as the odometry uses them at each frameset.
 
     Args:
         rig: Cameras and IMU.
         config: Configuration of all stages.
         synchroniser: Keeps the samples.
-        estimator: Of the state.
-        report: Takes stamp, kind and detail of an event.
+        estimator: Estimator of the state.
+        report: Receives stamp, kind and detail of an event.
     """
 
     def __init__(
@@ -68,29 +68,29 @@ class FramesetImu:
 
     @property
     def warnings(self) -> list[str]:
-        """Where the IMU contradicts the rig, a sentence each."""
+        """Warnings where the IMU contradicts the rig, a sentence each."""
         return self._clock.warnings if self._watch is None else self._watch.warnings
 
     @property
     def clock_shift_s(self) -> float:
-        """By how much the IMU's stamps have been found to be later than by the rig's time offset."""
+        """Time, s, by which the IMU's stamps were found to be later than by the rig's time offset."""
         return self._clock.shift_s
 
     def watch(
         self, stamp_ns: int, interval: ImuInterval | None, visual: VisualResult, applied: RelativeMotion | None
     ) -> bool:
-        """Leave the IMU out while it contradicts vision, and use one that comes late.
+        """Leave the IMU out while it contradicts vision, and use an IMU whose samples come late.
 
-        Of single cameras, which need the IMU, its clock is corrected.
+        With single cameras, which need the IMU, its clock is corrected instead.
 
         Args:
-            stamp_ns: Stamp of a frameset, by which the state has been updated.
-            interval: The IMU before it that has been used, or None.
-            visual: What vision measured there.
-            applied: The motion of it that the state has been updated by, or None.
+            stamp_ns: Stamp of a frameset by which the state has been updated.
+            interval: The IMU readings before it that have been used, or None.
+            visual: The front-end's result for the frameset.
+            applied: The motion by vision that the state has been updated by, or None.
 
         Returns:
-            Whether it is left out from now on, or used from now on, maybe by another clock.
+            Whether the use of the IMU changed: it is left out, or used, from now on, or its clock was corrected.
         """
         if self._clock_watch is not None:
             assert isinstance(self._estimator, MonocularEstimator)
@@ -117,7 +117,7 @@ class FramesetImu:
         return self.is_left_out != was_left_out
 
     def is_awaited(self, stamp_ns: int) -> bool:
-        """Whether the IMU's first sample is still awaited, without which there is nothing to initialise from."""
+        """Whether the IMU's first sample, from which the state is to be initialised, is still awaited."""
         if self._estimator.is_initialised:
             return False
         if self._first_ns is None:
@@ -126,7 +126,7 @@ class FramesetImu:
         return self._synchroniser.precedes_imu(stamp_ns) and stamp_ns - self._first_ns < longest_ns
 
     def begins(self, stamp_ns: int) -> bool:
-        """Whether this is the first frameset, or an IMU has come that begins an epoch, see `watch` for others."""
+        """Whether to initialise: at the first frameset, or where a late IMU begins an epoch (else see `watch`)."""
         if self._estimator.has_imu:
             return False
         if not self._estimator.is_initialised:
@@ -134,7 +134,7 @@ class FramesetImu:
         return self._watch is None and self._synchroniser.initial_interval(stamp_ns) is not None
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two framesets, or None where it does not cover them, or is left out."""
+        """Return the IMU readings between two framesets, or None where samples are missing, or the IMU is left out."""
         if not self._estimator.has_imu or self.is_left_out:
             return None
         interval = self._synchroniser.interval(start_ns, end_ns)
@@ -149,7 +149,7 @@ class FramesetImu:
     def gyro_rotation_since(self, then_ns: int) -> Float | None:
         """Return ``now_T_then`` (4, 4) of body from a frameset to the newest one, by the gyro and without translation.
 
-        It is what can be predicted while single cameras have no pose; None once they have, and if the gyro is doubted.
+        It is the only prediction while single cameras have no pose; None once they have one, or if the gyro is doubted.
         """
         is_doubted = self._clock_watch is not None and self._clock_watch.is_doubted
         if self._estimator.has_pose or not self._estimator.has_imu or is_doubted:
@@ -161,7 +161,7 @@ class FramesetImu:
         return se3(np.ascontiguousarray(then_R_now.T), np.zeros(3))
 
     def readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
-        """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""
+        """Return body's motion by the IMU while rolling shutters read a frameset out; None without rolling shutters."""
         if not self._readout_ns or not self._estimator.has_imu or self.is_left_out:
             return None
         interval = self._synchroniser.interval_after(stamp_ns, self._readout_ns)

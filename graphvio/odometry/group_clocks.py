@@ -1,8 +1,8 @@
-"""The clocks of pairs that are not triggered together: by how much the stamps of one are later than those of another.
+"""Estimation of the delays between the stamps of pairs that are not triggered together.
 
-Each pair has images of its own, and measures rotations between them, which are the gyro's at the instants at which the
-images were taken. Stamps that are late by the same time for all pairs are the IMU's time offset; what remains between
-two pairs is an error of their clocks, or of the time that their images take until they are stamped.
+Each such pair measures the rotations between its own images, which equal the gyro's rotations between the instants at
+which the images were taken. A delay that is the same for all pairs is the IMU's time offset; a difference between two
+pairs is an error of their clocks, or of the time that their images take until they are stamped.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _MIN_REPORTED_S, _MIN_REPORTED_SIGMAS = 1e-3, 5.0
 
 
 class GroupClocks:
-    """Corrects the stamps of pairs that have framesets of their own to the clock of the first of them.
+    """Corrects the stamps of pairs that come in separate framesets to the clock of the first such pair.
 
     Args:
-        rig: Of the pairs.
-        config: Says whether calibrations are estimated at all.
-        synchroniser: Gets the corrections, and has the IMU.
+        rig: The rig, with its pairs.
+        config: Configuration, which says whether calibrations are estimated at all.
+        synchroniser: Receives the corrections, and has the IMU samples.
         report: Receives one event for each pair whose stamps are off.
     """
 
@@ -41,18 +41,18 @@ class GroupClocks:
         self._noise_scale = config.smoother.imu_noise_scale
         self._synchroniser = synchroniser
         self._report = report
-        self._filters: dict[int, TimeOffsetFilter] = {}  # by group
-        self._late_s: dict[int, float] = {}  # in use
+        self._filters: dict[int, TimeOffsetFilter] = {}  # group -> filter
+        self._late_s: dict[int, float] = {}  # group -> delay in use
         self._warnings: dict[int, str] = {}
         self._moves: dict[int, Float] = {}  # stamp -> motion of body until then from the instant of the images
 
     @property
     def warnings(self) -> list[str]:
-        """The pairs whose stamps are off, a sentence each."""
+        """Warnings about pairs whose stamps are wrong, a sentence each."""
         return list(self._warnings.values())
 
     def update(self, frameset: FrameSet, visual: VisualResult) -> bool:
-        """Estimate from the motion of a frameset, and correct the stamps of those that follow.
+        """Update the delays with the motion of a frameset, and correct the stamps of later framesets.
 
         Returns:
             Whether a correction has changed.
@@ -72,12 +72,12 @@ class GroupClocks:
         return group != first and self._correct(frameset.stamp_ns, group, first)
 
     def motion_to_stamp(self, stamp_ns: int, state: RigState, rate: Float | None) -> Float | None:
-        """Return how body moves from the instant of the newest frameset's images to its stamp; None if it is the same.
+        """Return body's motion (4, 4) from the instant of the newest frameset's images to its stamp; None if equal.
 
         Args:
-            stamp_ns: Of the frameset.
-            state: At the instant of its images.
-            rate: (3,) rad/s of body, or None where it is not known.
+            stamp_ns: Stamp of the frameset.
+            state: State at the instant of its images.
+            rate: (3,) angular rate of body, rad/s, or None where it is not known.
         """
         seconds = 1e-9 * (stamp_ns - self._synchroniser.instant_ns(stamp_ns))
         if seconds == 0.0:
@@ -87,16 +87,16 @@ class GroupClocks:
         return self._moves[stamp_ns]
 
     def final_at_stamp(self, stamp_ns: int, estimator_T_body: Float) -> Float:
-        """Return the final pose (4, 4) of an earlier frameset at its stamp; of each once."""
+        """Return the final pose (4, 4) of an earlier frameset at its stamp; to be called once for each frameset."""
         body_T_stamped = self._moves.pop(stamp_ns, None)
         return estimator_T_body if body_T_stamped is None else estimator_T_body @ body_T_stamped
 
     def restart(self) -> None:
-        """Begin to estimate again, by another clock of the IMU; corrections stay."""
+        """Restart the estimation, as the IMU's clock has changed; corrections stay in force."""
         self._filters = {}
 
     def _correct(self, stamp_ns: int, group: int, first: int) -> bool:
-        """Correct the stamps of a group where they are known to be off from those of the first one."""
+        """Correct the stamps of a group where they are known to differ from those of the first group."""
         own, reference = self._filters[group].estimate, self._filters[first].estimate
         if not (own.is_usable and reference.is_usable):
             return False

@@ -1,4 +1,4 @@
-"""The clock of the IMU: by how much it is off beyond what the calibration is for, and its correction."""
+"""The error of the IMU's clock that exceeds what the calibration corrects, and its correction."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
 MAX_SHIFT_S = 1.5
-"""Largest error of the clock that is looked for."""
-_MIN_REPORTED_S = 1e-3  # several corrections may add up to nearly none
+"""Largest error of the clock that is searched for, s."""
+_MIN_REPORTED_S = 1e-3  # several corrections may nearly cancel
 
 
 def with_late_clock(rig: Rig, seconds: float) -> Rig:
-    """Return a rig whose IMU's stamps are so much later; the same one where a rig file cannot say so."""
+    """Return a rig with the IMU's time offset increased; the same rig where a rig file does not allow that offset."""
     if rig.imu is not None and seconds:
         with suppress(RigError):
             return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + seconds))
@@ -24,42 +24,43 @@ def with_late_clock(rig: Rig, seconds: float) -> Rig:
 
 
 class ImuClock:
-    """What has been found out about the IMU's clock.
+    """Keeps the error of the IMU's clock, and corrects it.
 
     Args:
-        max_late_s: A clock that is later is reported, and not corrected: framesets do not wait for so long.
-        synchroniser: Takes corrections.
+        max_late_s: Largest lateness that is corrected, s. A later clock is only reported, as framesets do not wait for
+            so long.
+        synchroniser: Receives corrections.
         report: Receives events.
 
     Attributes:
-        shift_s: By how much its stamps are later than by the rig's time offset.
-        is_too_late: Whether it is not corrected for being so late.
+        shift_s: Time, s, by which the IMU's stamps are later than by the rig's time offset.
+        is_too_late: Whether the clock is too late to be corrected.
     """
 
     def __init__(self, max_late_s: float, synchroniser: Synchroniser, report: Report) -> None:
         self.shift_s = 0.0
         self.is_too_late = False
-        self._corrected_s = 0.0  # of it, for this run
+        self._corrected_s = 0.0  # part of `shift_s` that is corrected in this run
         self._max_late_s = max_late_s
         self._synchroniser = synchroniser
         self._report = report
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be corrected in the rig, a sentence or none."""
+        """Warning about the clock's error, a sentence or none."""
         if abs(self.shift_s) < _MIN_REPORTED_S:
             return []
         return [f"IMU: {self._relation}; {self._what_is_done}"]
 
     def correct(self, stamp_ns: int, shift_s: float) -> bool:
-        """Correct the clock, where its stamps are so much later than by the last correction.
+        """Correct the clock, whose stamps are later than after the last correction.
 
         Args:
-            stamp_ns: Of the frameset at which it was found.
-            shift_s: Seconds.
+            stamp_ns: Stamp of the frameset at which the error was found.
+            shift_s: Time by which the stamps are later, s.
 
         Returns:
-            Whether it is corrected; where it is too late, that is reported once.
+            Whether the clock is corrected; where it is too late for that, this is reported once.
         """
         self.shift_s = self._corrected_s + shift_s
         was_too_late, self.is_too_late = self.is_too_late, self.shift_s > self._max_late_s
@@ -72,7 +73,7 @@ class ImuClock:
         return True
 
     def keep(self) -> None:
-        """Record that the clock is right as it is corrected now."""
+        """Record that the clock is right with the present correction."""
         self.shift_s, self.is_too_late = self._corrected_s, False
 
     @property

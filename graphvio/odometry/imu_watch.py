@@ -1,10 +1,10 @@
-"""Watches whether the IMU agrees with vision, and leaves it out while it does not.
+"""A check whether the IMU agrees with vision, which leaves the IMU out while it does not.
 
 The innovation test trusts the prediction: where vision is refused for a moment, a crowd or a reflection has misled it.
-An IMU whose clock jumps, or whose axes, units or time offset are not those of the rig, contradicts vision for good, and
-would bend the whole path. When vision of good quality has been refused for so long that the estimator takes it for
-right, the IMU is therefore left out, until it moves as the cameras do. Where it does so at another time, its clock is
-corrected.
+An IMU whose clock jumps, or whose axes, units or time offset are not those of the rig, contradicts vision permanently,
+and would distort the whole path. When vision of good quality has been refused for so long that the estimator considers
+it correct, the IMU is therefore left out, until it moves as the cameras do. If it does so with a time shift, its clock
+is corrected.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from graphvio.measurements.motion import PairReport, Quality, RelativeMotion, Vi
 from graphvio.odometry.imu_clock import MAX_SHIFT_S, ImuClock
 from graphvio.odometry.synchroniser import Synchroniser
 
-_COMPARED_NS = 4_000_000_000  # of rotations
+_COMPARED_NS = 4_000_000_000  # time over which rotations are compared
 _MAX_STEP_NS = 500_000_000  # between framesets whose rotation is compared
-_CHECK_NS = 1_000_000_000  # from one comparison to the next
-_FIRST_WAIT_NS = 1_000_000_000  # until the first one; four times as long each time
+_CHECK_NS = 1_000_000_000  # time from one comparison to the next
+_FIRST_WAIT_NS = 1_000_000_000  # until the first comparison; each time four times as long
 _MAX_WAIT_NS = 60_000_000_000
-_TRUSTED_AGAIN = 10  # if the IMU was right for this many waits, the next wait has the first value again
+_TRUSTED_AGAIN = 10  # if the IMU was right for so many waits, the next wait has the first value again
 _MIN_INLIERS = 20
-_MAX_WITNESSES = 2  # pairs that see the same motion: what misleads one of them does not mislead the other
-_MIN_SHIFT_S = 0.005  # less is the calibration's
+_MAX_WITNESSES = 2  # pairs that see the same motion: what misleads one hardly misleads the other
+_MIN_SHIFT_S = 0.005  # smaller shifts are left to the calibration
 
 
 def _bears_out(report: PairReport) -> bool:
-    """Whether most of what a pair sees moves as the motion says."""
+    """Whether the motion explains most of a pair's points."""
     return report.inliers >= max(_MIN_INLIERS, 0.5 * report.points)
 
 
@@ -39,9 +39,9 @@ class ImuWatch:
     """Decides whether the IMU is used, and by which clock.
 
     Args:
-        max_refused_s: Vision of good quality that is refused for longer, within twice the time, is right. Where two
-            pairs see the same motion, half of it is enough.
-        clock: Takes corrections.
+        max_refused_s: If vision of good quality is refused for longer than this, within twice the time, vision is right
+            and the IMU wrong. Where two pairs see the same motion, half of the time is enough.
+        clock: Receives corrections.
         synchroniser: Has the samples.
         report: Receives events.
 
@@ -55,18 +55,18 @@ class ImuWatch:
         self._clock = clock
         self._synchroniser = synchroniser
         self._report = report
-        self._refused: deque[tuple[int, int]] = deque()  # stamp, and what a refused motion counts, or 0
-        self._steps: deque[VisualStep] = deque()  # each begins where the one before ends
+        self._refused: deque[tuple[int, int]] = deque()  # stamp, and the weight of a refused motion, ns, or 0
+        self._steps: deque[VisualStep] = deque()  # each begins where the previous one ends
         self._before: RelativeMotion | None = None
         self._before_ns = 0
-        self._since_ns = 0  # first refused motion
-        self._next_ns = 0  # of the next comparison
+        self._since_ns = 0  # stamp of the first refused motion
+        self._next_ns = 0  # stamp of the next comparison
         self._wait_ns = _FIRST_WAIT_NS
-        self._used_since_ns = 0  # it was left out until then
+        self._used_since_ns = 0  # stamp until which it was left out
 
     @property
     def warnings(self) -> list[str]:
-        """What contradicts the rig, a sentence each."""
+        """Warnings where the IMU contradicts the rig, a sentence each."""
         found = self._clock.warnings
         if self.is_left_out and not self._clock.is_too_late:
             found.append("IMU: it contradicts the cameras, and is left out; check its clock, its axes and its units")
@@ -78,9 +78,9 @@ class ImuWatch:
         """Update the test whether the IMU agrees with vision, by a frameset.
 
         Args:
-            stamp_ns: Its stamp.
-            visual: What vision measured.
-            gate_result: Of the test against a prediction by the IMU; None where there was none.
+            stamp_ns: Stamp of the frameset.
+            visual: The front-end's result for it.
+            gate_result: Result of the test of vision against a prediction by the IMU; None where there was none.
             is_applied: Whether the state has been updated by a motion of vision.
 
         Returns:
@@ -103,7 +103,7 @@ class ImuWatch:
         return None
 
     def _leave_out(self, stamp_ns: int) -> None:
-        """Leave the IMU out until the rotations since it was first refused can be compared."""
+        """Leave the IMU out until its rotations since vision was first refused can be compared with the cameras'."""
         self._since_ns = next(ns for ns, refused_ns in self._refused if refused_ns)
         self._refused.clear()
         if stamp_ns - self._used_since_ns >= _TRUSTED_AGAIN * self._wait_ns:
@@ -117,7 +117,7 @@ class ImuWatch:
         )
 
     def _compare(self, stamp_ns: int) -> ImuMatch | None:
-        """Use the IMU again if it moves as the cameras do, now or at another time."""
+        """Use the IMU again if it moves as the cameras do, possibly with a time shift."""
         self._next_ns = stamp_ns + _CHECK_NS
         steps = [step for step in self._steps if step.begin_ns >= self._since_ns]
         match = match_imu(steps, self._synchroniser.mean_readings(), MAX_SHIFT_S)
@@ -132,7 +132,7 @@ class ImuWatch:
         return match
 
     def _add_step(self, step_ns: int, motion: RelativeMotion | None) -> None:
-        """Add the motion since the frameset before; where that is not known, what follows is not compared with it."""
+        """Add the motion since the previous frameset; if it is not known, discard the earlier steps."""
         before, self._before = self._before, motion
         begin_T_end = None
         if motion is not None and 0 < step_ns < _MAX_STEP_NS:

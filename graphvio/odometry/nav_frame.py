@@ -1,4 +1,4 @@
-"""The nav frame of the estimates, which follows the cameras where their attitude in body is corrected."""
+"""The nav frame of the estimates, in which body is turned when the cameras' attitude in body is corrected."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ _KEPT_TURNS = 100  # a state leaves the estimator's window within far fewer
 
 
 class NavFrame:
-    """Carries states from the estimator's frame to nav.
+    """Converts states from the estimator's frame to nav.
 
-    The path was measured by cameras. With a wrong attitude of these in body it is right but for a turn of the whole
-    path, and body's attitude is wrong by the same turn. When the calibration is corrected, it is therefore body that
-    has to turn in nav: if body's attitude went on instead, the path would bend there. Positions go on, and gravity
-    keeps its direction in body. The estimator knows nothing of this, since none of its measurements depends on nav.
+    The path is measured by the cameras. If their attitude in body is wrong, the path is correct except for a rotation
+    of the whole path, and body's attitude is wrong by the same rotation. When the calibration is corrected, body
+    therefore has to turn in nav: if body's attitude were continued instead, the path would bend at that point.
+    Positions continue, and gravity keeps its direction in body. The estimator is not involved, since none of its
+    measurements depends on nav.
     """
 
     def __init__(self) -> None:
         self._turns: deque[tuple[int, Float]] = deque(maxlen=_KEPT_TURNS)  # first stamp, nav_T_estimator (4, 4)
 
     def turn(self, stamp_ns: int, estimator_T_body: Float, old_R_new: Float) -> Float:
-        """Turn body where it is now.
+        """Turn body at its present position.
 
         Args:
-            stamp_ns: Of the first estimate that it applies to.
+            stamp_ns: Stamp of the first estimate to which the turn applies.
             estimator_T_body: (4, 4) newest pose in the estimator's frame.
             old_R_new: (3, 3) rotation of the corrected body frame relative to the previous one, with the first pair's
                 left camera held fixed.
@@ -58,7 +59,7 @@ class NavFrame:
         )
 
     def covariance(self, covariance: StateCovariance) -> StateCovariance:
-        """Return the covariance of the newest state in nav; what is in body's frame or of level axes stays."""
+        """Return the covariance of the newest state in nav; blocks in body or about level axes are unchanged."""
         if not self._turns:
             return covariance
         nav_R_estimator = self._nav_T_estimator[:3, :3]
@@ -69,7 +70,7 @@ class NavFrame:
         return replace(covariance, velocity=velocity, gravity=gravity)
 
     def pose(self, stamp_ns: int, estimator_T_body: Float) -> Float:
-        """Return an earlier pose (4, 4) in nav as it was at its stamp."""
+        """Return an earlier pose (4, 4) in nav, with the turn that was in force at its stamp."""
         for begin_ns, nav_T_estimator in reversed(self._turns):
             if begin_ns <= stamp_ns:
                 return np.asarray(nav_T_estimator @ estimator_T_body)

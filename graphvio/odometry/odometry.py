@@ -1,4 +1,4 @@
-"""The odometry: IMU samples and framesets in, estimates out, without I/O.
+"""The odometry, which turns IMU samples and framesets into estimates, without I/O.
 
 The main loop has the structure of the paper's figure 3; each of its stages may differ from the paper's."""
 
@@ -58,19 +58,19 @@ from graphvio.timing import timed
 
 
 class _Predicted(NamedTuple):
-    """How the state at a frameset's instant was obtained."""
+    """The origin of the state at a frameset's instant: an initialisation or a prediction."""
 
     stamp_ns: int
-    is_initial: bool  # initialised there, not predicted
+    is_initial: bool  # whether it was initialised there, not predicted
     interval: ImuInterval | None
-    initialisations: int  # number of them before it
+    initialisations: int  # number of initialisations before it
 
 
 def _check_config(rig: Rig, config: Config) -> None:
     """Check that the rig has what the configuration asks for.
 
     Raises:
-        ConfigError: If the configuration asks for what such a rig does not have.
+        ConfigError: If the configuration asks for sensors that the rig does not have.
     """
     if not rig.pairs and (config.fusion.estimator == "filter" or config.fusion.estimate_time_offset):
         raise ConfigError(
@@ -100,8 +100,8 @@ class Odometry:
         config: Configuration of all stages.
         on_prediction: Called with the prediction at each IMU sample, within `process`.
         image_mask: Called with a camera's name and each of its images (height, width), from several threads; returns
-            a mask of that size, whose zeros are not used, or None. What is masked becomes no corner, and tracks that
-            enter it end.
+            a mask of that size, whose zeros are not used, or None. No corners are detected in masked pixels, and tracks
+            that enter them end.
 
     Attributes:
         rig: Cameras and IMU.
@@ -154,12 +154,12 @@ class Odometry:
         """Feed one IMU sample or frameset, and return at most one estimate.
 
         Args:
-            measurement: An IMU sample or a frameset; those of each sensor in time order. Stamps of framesets are taken
-                as instants: a source has added ``stamp_offset_s`` of the rig's cameras to those of their images.
+            measurement: An IMU sample or a frameset; those of each sensor in time order. The stamp of a frameset is
+                taken as the instant of its images: the source has already added the cameras' ``stamp_offset_s``.
 
         Returns:
             The estimate of the oldest frameset that is due, or None while there is none. At most one frameset is
-            processed in a call; what is still held comes with later measurements or with `finish`.
+            processed in a call; the estimates of those still held come with later measurements or with `finish`.
 
         Raises:
             MeasurementError: If the measurement is malformed, or the odometry has been finished.
@@ -197,7 +197,7 @@ class Odometry:
     def process_held(self) -> Estimate | None:
         """Process the oldest held frameset, without waiting for its IMU samples.
 
-        For real time; samples that come later are used for the motion after it.
+        This is meant for real time; samples that come later are used for the motion after it.
 
         Returns:
             Its estimate, or None if no frameset is held.
@@ -227,7 +227,7 @@ class Odometry:
         """Predict the rig's state from the newest estimate and the IMU since then; thread-safe.
 
         Args:
-            stamp_ns: On the framesets' clock: an IMU sample's stamp less the rig's time offset.
+            stamp_ns: Instant on the framesets' clock: an IMU sample's stamp less the rig's time offset.
 
         Returns:
             The state, or None: before the first pose, and while lost; for an instant before the newest estimate; for
@@ -249,7 +249,7 @@ class Odometry:
 
     @property
     def rig_warnings(self) -> list[str]:
-        """Where the measurements contradict the rig: a sentence each, with the size and what is done about it."""
+        """Warnings where the measurements contradict the rig: a sentence each, with size and what is done about it."""
         off = [f"{finding}; {CORRECTED}" for finding in self.calibration_findings if finding.is_significant]
         return (
             self._vision_events.rig_warnings
@@ -262,17 +262,17 @@ class Odometry:
 
     @property
     def calibration(self) -> CalibrationEstimate | None:
-        """What is known of the calibration now, or None where it is not estimated."""
+        """The present estimate of the calibration, or None where it is not estimated."""
         return self._calibration.estimate
 
     @property
     def calibration_findings(self) -> list[Finding]:
-        """What is known of each part of the calibration; empty where it is not estimated."""
+        """The present findings for each part of the calibration; empty where it is not estimated."""
         return self._calibration.findings
 
     @property
     def refined_rig(self) -> Rig | None:
-        """The rig with the calibration as it is known now; None where nothing of it is estimated, or known yet."""
+        """The rig with the present estimate of its calibration; None where nothing is estimated, or known yet."""
         estimate = self._calibration.estimate
         if estimate is None and not self.clock_shift_s:
             return None
@@ -280,11 +280,11 @@ class Odometry:
 
     @property
     def clock_shift_s(self) -> float:
-        """By how much the IMU's stamps have been found to be later than by the rig's time offset, see `ImuClock`."""
+        """Time, s, by which the IMU's stamps were found to be later than by the rig's time offset, see `ImuClock`."""
         return self._imu.clock_shift_s
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Register a function that gets the measurements of each full window of the self-calibration.
+        """Register a function that receives the measurements of each full window of the self-calibration.
 
         Args:
             on_window: called within `process`.
@@ -292,23 +292,23 @@ class Odometry:
         self._calibration.on_full_window(on_window)
 
     def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
-        """Register a function that gets each view of a landmark once, of rigs of single cameras only.
+        """Register a function that receives each view of a landmark once; for rigs of single cameras only.
 
         Args:
             on_views: called within `process` and `finish`, when landmarks leave the window; and once in an epoch with
-                what was known before its first pose.
+                what was known of its first states before its first pose.
         """
         if isinstance(self._estimator, MonocularEstimator):
             self._estimator.on_views(on_views)
 
     def limit_corners(self, share: float) -> None:
-        """Follow fewer corners from now on, where real time demands it; from the thread that calls `process`.
+        """Track fewer corners from now on, where real time demands it; to be called from the thread of `process`.
 
         Args:
-            share: Above 0 and up to 1, of the corners that the configuration asks for.
+            share: Share of the corners that the configuration asks for, above 0 and up to 1.
 
         Raises:
-            ConfigError: If it is no such share.
+            ConfigError: If ``share`` is not in this range.
         """
         if not 0.0 < share <= 1.0:
             raise ConfigError(f"share of the corners: is {share}; give more than 0, and at most 1")
@@ -318,7 +318,7 @@ class Odometry:
         """Register functions that are called after each frameset, in the thread that calls `process`: keep them short.
 
         Args:
-            on_step: Takes each step from now on, before its estimate is returned.
+            on_step: Called with each step from now on, before its estimate is returned.
             on_finish: Called when no step follows.
         """
         self._on_step.append(on_step)
@@ -364,7 +364,7 @@ class Odometry:
     def _predict(self, stamp_ns: int) -> _Predicted:
         """Initialise the state at a frameset, or predict it there.
 
-        By preintegration, or without IMU samples by constant velocity (eq. 11, 12).
+        The prediction is by preintegration, or without IMU samples by constant velocity (eq. 11, 12).
         """
         initialisations = self._estimator.initialisations
         if self._imu.begins(stamp_ns):
@@ -395,7 +395,7 @@ class Odometry:
 
     @timed("update")
     def _update(self, predicted: _Predicted, applied: MeasurementUpdate) -> Status:
-        """Solve for the state, and drop the tracks that it shows to move."""
+        """Solve for the state, and drop the tracks of points that prove to move."""
         # `keyframe_of` asks for the motion since the previous keyframe, so its state must stay in the window.
         previous_keyframe = set() if self._keyframe_ns is None else {self._keyframe_ns}
         update = self._estimator.update(
@@ -424,7 +424,7 @@ class Odometry:
         self._time_offset.update(stamp_ns, visual)
 
     def _recalibrate(self, stamp_ns: int, visual: VisualResult, status: Status) -> None:
-        """Let the calibration take what the cameras see, and use the one that comes into force."""
+        """Update the calibration with a frameset, and use the new one if it has changed."""
         self._calibration.add(stamp_ns, visual.quality, status)
         old_R_new = self._calibration.update(stamp_ns)
         if old_R_new is not None:
@@ -440,7 +440,7 @@ class Odometry:
         applied: MeasurementUpdate,
         status: Status,
     ) -> Estimate:
-        """Assemble the estimate, and hand the step to those who listen."""
+        """Assemble the estimate, and pass the step to the subscribers."""
         estimator, interval = self._estimator, predicted.interval
         rates = self._rates.update(visual.motion, interval, estimator.state().gyro_bias, estimator.latest_rate())
         measured = estimate_by_measurements(
@@ -491,7 +491,7 @@ class Odometry:
         )
 
     def _add_sample(self, sample: ImuSample) -> None:
-        """Hand on a sample, and the prediction at it to those who asked for it; by vision where the IMU is left out."""
+        """Pass on a sample, and the prediction at it if one is asked for; by vision where the IMU is left out."""
         stamp_ns, values = self._synchroniser.corrected(sample)
         if self._imu.is_left_out:
             is_predicted = True

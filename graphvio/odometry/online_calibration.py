@@ -1,4 +1,4 @@
-"""What the calibration during the run does for the odometry, whoever estimates it."""
+"""The interface between the odometry and the calibration during the run, however that is estimated."""
 
 from __future__ import annotations
 
@@ -17,45 +17,45 @@ from graphvio.self_calibration.findings import Finding
 class OnlineCalibration(Protocol):
     """The calibration of the rig while the odometry runs.
 
-    Once for each frameset: `with_calibration_covariance` before the state takes what vision measured, then `add` and
-    `update`. Other stages get a corrected calibration within `update`. What contradicts the rig file is reported as an
-    event to the function that the calibration is made with.
+    It is called once for each frameset: `with_calibration_covariance` before the state is updated with the motion by
+    vision, then `add` and `update`. `update` passes a corrected calibration to the other stages. Contradictions to the
+    rig file are reported as events to a function that is passed to the constructor.
     """
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
-        """What is known of the calibration now, or None where nothing is: it is not estimated, or not yet."""
+        """The present estimate of the calibration, or None where it is not estimated, or not yet."""
 
     @property
     def findings(self) -> list[Finding]:
-        """What is known of each part of the calibration; empty where `estimate` is None."""
+        """The present findings for each part of the calibration; empty where `estimate` is None."""
 
     @property
     def warnings(self) -> list[str]:
-        """What the images say against the rig file that is not corrected, a sentence each."""
+        """Warnings where the images contradict the rig file and it is not corrected, a sentence each."""
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Register a function that gets windows of keyframes, from which a whole recording can be calibrated.
+        """Register a function that receives windows of keyframes, from which a whole recording can be calibrated.
 
         Args:
-            on_window: Called within `add` with each window that is full. There is none where nothing is estimated.
+            on_window: Called within `add` with each full window; never called where nothing is estimated.
         """
 
     def add_sample(self, sample: ImuSample) -> None:
         """Add an IMU sample, in time order.
 
         Args:
-            sample: As it was measured, by the rig file's scale and axes and on the IMU's clock; not yet corrected.
+            sample: Sample as measured, with the rig file's scale and axes, on the IMU's clock; not yet corrected.
         """
 
     def restart_imu(self) -> None:
-        """Forget the IMU samples until now: the IMU is left out, or those that follow are of another clock."""
+        """Forget the IMU samples until now, as the IMU is left out, or its clock has been corrected."""
 
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
-        """Return what vision measured, with the covariance that errors of the calibration add to its innovations.
+        """Return the front-end's result with the covariance that errors of the calibration add to its innovations.
 
         Args:
-            visual: Of a frameset, to which the state has been predicted.
+            visual: Result for a frameset, to which the state has been predicted.
 
         Returns:
             The same motions, with their ``calibration_covariance``, see `RelativeMotion`.
@@ -65,16 +65,16 @@ class OnlineCalibration(Protocol):
         """Update the estimation by a frameset, with its pose and its tracks.
 
         Args:
-            stamp_ns: Of the frameset, by which the state has been updated.
-            quality: Of what vision measured.
+            stamp_ns: Stamp of the frameset, by which the state has been updated.
+            quality: Quality of the motion by vision.
             status: What the pose is based on.
         """
 
     def update(self, stamp_ns: int) -> Float | None:
-        """Let the other stages use the calibration that comes into force after a frameset.
+        """Pass the calibration that comes into force after a frameset to the other stages.
 
         Args:
-            stamp_ns: Of the frameset, for events.
+            stamp_ns: Stamp of the frameset, for events.
 
         Returns:
             (3, 3) rotation ``old_R_new`` of the corrected body frame relative to the previous one, with the first
@@ -100,4 +100,4 @@ class OnlineCalibration(Protocol):
         """
 
     def close(self) -> None:
-        """End what runs beside the odometry: no frameset follows."""
+        """Stop threads that run beside the odometry: no frameset follows."""

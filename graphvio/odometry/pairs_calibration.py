@@ -1,4 +1,4 @@
-"""The calibration of a rig with stereo pairs: estimated beside the state, and used by the other stages."""
+"""The online calibration of a rig with stereo pairs, estimated beside the state and passed to the other stages."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from graphvio.self_calibration.parameters import n_camera_parameters
 
 _MAX_TURN_RAD = np.deg2rad(0.3)  # a larger correction of the cameras' attitude begins a new keyframe
 _DISTRUST_SIGMAS = 5.0  # if an IMU parameter changes by more than this, predictions made before are wrong
-_AVERAGED = 100  # samples, whose mean specific force is about that of gravity
+_AVERAGED = 100  # number of samples whose mean specific force is about that of gravity
 
 
 class PairsCalibration:
     """An `OnlineCalibration` of a rig with at least one stereo pair, by `SelfCalibration`.
 
     Args:
-        rig: Of the rig file.
+        rig: The rig, with the calibration of the rig file.
         config: Configuration of all stages.
-        frontend: Has the tracks, and takes corrected cameras.
-        synchroniser: Takes corrections of the IMU and its time offset.
-        estimator: Has the state.
+        frontend: Front-end, which has the tracks, and receives corrected cameras.
+        synchroniser: Receives corrections of the IMU and its time offset.
+        estimator: State estimator.
         report: Receives events.
     """
 
@@ -60,35 +60,35 @@ class PairsCalibration:
         self._imu_fault_tolerant = estimator if isinstance(estimator, ImuFaultTolerant) else None
         self._report = report
         self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
-        self._mean_force: Float = np.zeros(3)  # of the first samples
+        self._mean_force: Float = np.zeros(3)  # mean specific force of the first samples
         self._averaged = 0
         self._epoch = 0
         self._is_reported = False
         self._is_refusal_reported = False
-        self._restarts = 0  # of the calibration, that were reported
-        self._reported: set[str] = set()  # pairs
+        self._restarts = 0  # restarts of the calibration that were reported
+        self._reported: set[str] = set()  # names of pairs
         self._calibration = SelfCalibration(rig)
-        self._motion: RelativeMotion | None = None  # by vision, of the newest frameset
+        self._motion: RelativeMotion | None = None  # motion by vision at the newest frameset
         self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
-        self._in_force = np.zeros_like(self.estimate.difference)  # of the calibration from the rig file
+        self._in_force = np.zeros_like(self.estimate.difference)  # difference of the calibration from the rig file
         self._margin_px = self._epipolar_margin_px()
         frontend.recalibrate(rig, self._margin_px)
 
     @property
     def estimate(self) -> CalibrationEstimate:
-        """What is known of the calibration now."""
+        """The present estimate of the calibration."""
         return self._calibration.estimate
 
     @property
     def findings(self) -> list[Finding]:
-        """What is known of each part of the calibration; nothing is significant before a second window confirms it."""
+        """The present findings for each part; none is significant before a second window confirms the calibration."""
         found = self._calibration.findings()
         return found if self._calibration.is_confirmed else [replace(each, is_significant=False) for each in found]
 
     @property
     def warnings(self) -> list[str]:
-        """What the images say against the rig file that is not corrected, a sentence each."""
+        """Warnings where the images contradict the rig file and it is not corrected, a sentence each."""
         name = self._calibration.implausible_parameter
         if name is None:
             return []
@@ -98,11 +98,11 @@ class PairsCalibration:
         ]
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Register a function that gets each window before it is adjusted for the last time."""
+        """Register a function that receives each window before it is adjusted for the last time."""
         self._calibration.on_full_window = on_window
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Add an IMU sample; the first ones show the force at which scale and axes may be wrong."""
+        """Add an IMU sample; the mean specific force of the first ones becomes the fixed force of `ImuCorrection`."""
         self._calibration.add_sample(sample)
         if self._averaged < _AVERAGED:
             self._averaged += 1
@@ -120,7 +120,7 @@ class PairsCalibration:
         return self._innovation_covariance.with_calibration_covariance(visual, self._estimator)
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Add a frameset as a candidate for a keyframe, where its pose is of use."""
+        """Add a frameset as a candidate for a keyframe, if its pose is usable."""
         calibration, estimator, references = self._calibration, self._estimator, self._frontend.reference_stamps_ns
         instant_ns = self._synchroniser.instant_ns(stamp_ns)
         if estimator.epoch != self._epoch:
@@ -143,7 +143,7 @@ class PairsCalibration:
         calibration.add_frameset(instant_ns, pose, views, quality is Quality.WEAK, is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:
-        """Give cameras to the front-end, and the IMU's scale, axes and time offset to the synchroniser."""
+        """Pass cameras to the front-end, and the IMU's scale, axes and time offset to the synchroniser."""
         was_confirmed = self._calibration.is_confirmed
         has_changed = self._calibration.update()
         if self._calibration.restarts > self._restarts:
@@ -173,19 +173,19 @@ class PairsCalibration:
         return self._turn()
 
     def correct_pose(self, turned: Float) -> None:
-        """Count the change as error that motions until now no longer have."""
+        """Remove the corrected error from that of the motions until now."""
         self._calibration.correct_pose(turned)
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
-        """Return what the errors that are left have done to the motions until now."""
+        """Return the covariance (6, 6) that the remaining calibration errors have added to the motions until now."""
         return self._calibration.pose_covariance(odom_T_body)
 
     def close(self) -> None:
-        """End the thread of the adjustments."""
+        """Stop the thread of the adjustments."""
         self._calibration.close()
 
     def _correct_imu(self) -> None:
-        """Let the synchroniser correct samples as the calibration in force has it."""
+        """Let the synchroniser correct samples with the calibration that is in force."""
         if self._rig.imu is None:
             return
         self._synchroniser.imu_correction = ImuCorrection(*self.estimate.imu_matrices, self._mean_force)
@@ -194,11 +194,12 @@ class PairsCalibration:
             self._synchroniser.add_to_time_offset(wanted_s - self._synchroniser.time_offset_s)
 
     def _hand_over_inertial_state(self) -> None:
-        """Let the estimator go on with what the window knows of velocity, biases and gravity.
+        """Pass velocity, biases and gravity from the window's adjustment to the estimator.
 
-        The estimator has taken errors of the calibration for motion until now; to the window they are unknowns. But it
-        takes views by rolling shutters for those of global ones, as they were compensated: in a turn, an error of the
-        IMU's clock, which is in that compensation, then looks like one of gravity and biases.
+        Until now the estimator has attributed errors of the calibration to the motion; in the window they are unknowns.
+        But the window treats views by rolling shutters, which were compensated, as those of global shutters: in a turn,
+        an error of the IMU's clock, which is part of that compensation, then looks like one of gravity and biases. So
+        nothing is passed on for a rig with rolling shutters.
         """
         known, tolerant = self._calibration.inertial_state, self._imu_fault_tolerant
         if known is None or tolerant is None or any(camera.line_time_us for camera in self._rig.cameras):
@@ -209,19 +210,19 @@ class PairsCalibration:
             self._frontend.start_keyframe()
 
     def _turn(self) -> Float | None:
-        """Return how the body of the calibration in force is turned, see `OnlineCalibration.update`."""
+        """Return the rotation of body by the calibration in force, see `OnlineCalibration.update`."""
         old_R_left, new_R_left = self._body_R_first_left, self.estimate.rig.pairs[0].left.body_T_cam[:3, :3]
         self._body_R_first_left = new_R_left
         if self._restarts or np.array_equal(new_R_left, old_R_left):
             return None
         old_R_new: Float = old_R_left @ new_R_left.T
         if self._rig.imu is not None and np.linalg.norm(so3_log(old_R_new)) > _MAX_TURN_RAD:
-            # Measured again from an older reference, the way would have a jump that no IMU can follow.
+            # Measured again from an older reference, the motion would have a jump that contradicts the IMU.
             self._frontend.start_keyframe()
         return old_R_new
 
     def _report_findings(self, stamp_ns: int) -> None:
-        """Report once that the rig file is wrong beyond 5 sigma, and each pair that is not where the file has it."""
+        """Report once that the rig file is wrong beyond 5 sigma, and once each pair with wrong extrinsics in it."""
         found = self._calibration.findings()
         wrong = contradiction(found)
         if wrong is not None and self._calibration.is_confirmed and not self._is_reported:
@@ -234,7 +235,7 @@ class PairsCalibration:
                 self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; {CORRECTED}")
 
     def _epipolar_margin_px(self) -> float:
-        """Return by how much epipolar lines may be off: by the rig file's errors until these are estimated."""
+        """Return the margin for errors of epipolar lines by the rig file, px; zero once the calibration is trusted."""
         if self._calibration.is_trusted:
             return 0.0
         sigmas, focal_px = self._rig.calibration_sigmas, max(pair.left.focal_px for pair in self._rig.pairs)

@@ -1,4 +1,4 @@
-"""Calibration of a rig from a whole recording, by its self-calibration, with a check of one half by the other."""
+"""Calibration of a rig from a whole recording by self-calibration, with a comparison of the recording's two halves."""
 
 from __future__ import annotations
 
@@ -33,29 +33,30 @@ _IMU = ("body_rotation_deg", "body_translation_m", "time_offset_s", "imu_scale_s
 GROUPS: dict[str, tuple[str, ...]] = {
     "cameras": _CAMERAS, "stereo": _STEREO, "imu": _IMU, "all": tuple(CalibrationSigmas().values),
 }  # fmt: skip
-"""What can be calibrated -> the standard deviations of its parameters, see `CalibrationSigmas`."""
+"""Name of what can be calibrated -> names of its parameters' standard deviations, see `CalibrationSigmas`."""
 _FIXED = {"cameras": _STEREO, "stereo": _CAMERAS, "imu": _CAMERAS + _STEREO, "all": ()}
-"""What is fixed meanwhile. Where pairs and IMU are is estimated along: wrong extrinsics would be taken for cameras."""
+"""Name of what is calibrated -> parameters that are fixed meanwhile. The poses of pairs and IMU are estimated as well:
+errors of their extrinsics would otherwise be attributed to the cameras."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, how much of it is done, and how much there is."""
+"""Callback that receives the stage, the amount of work done in it, and the total amount."""
 
-_FIXED_SHARE = 1e-3  # of the standard deviations, for what is kept as in the file
+_FIXED_SHARE = 1e-3  # factor on the standard deviations of parameters that are kept as in the file
 _MIN_WINDOWS = 2
 _MIN_OF_HALVES = 4
-_CHANCE = 1e-3  # by which halves that agree are said not to
+_CHANCE = 1e-3  # probability that halves that agree are reported as disagreeing
 
 
 @dataclass(frozen=True)
 class HalfComparison:
-    """How well two halves of a recording agree in one group of parameters.
+    """The agreement of two halves of a recording in one group of parameters.
 
     Attributes:
-        group: as in `graphvio.self_calibration.curves`.
+        group: name of the group, as in `graphvio.self_calibration.curves`.
         statistic: squared Mahalanobis distance, about as large as ``dimension`` where they agree.
         dimension: number of parameters.
         size: largest difference, in ``unit``.
-        unit: of it.
+        unit: unit of ``size``.
     """
 
     group: str
@@ -76,14 +77,14 @@ class RecordedCalibration:
 
     Attributes:
         what: one of `GROUPS`.
-        file_rig: of the rig file.
-        batch: what all windows say.
-        halves: what the windows of the first and of the second half say, or None for a short recording, and where they
-            were not wanted.
+        file_rig: the rig of the rig file.
+        batch: calibration from all windows.
+        halves: calibrations from the windows of the first and of the second half, or None for a short recording, or if
+            the comparison was not requested.
         end_ns: stamp of the last frameset.
-        is_file_exact: whether the odometry found nothing that speaks against the rig file.
-        all_findings: what is known of all parts where none is kept as in the file.
-        clock_shift_s: by how much the IMU's stamps are late beyond what the calibration of its time offset is for.
+        is_file_exact: whether the odometry found nothing that contradicts the rig file.
+        all_findings: the odometry's findings for all parts, with none kept as in the file.
+        clock_shift_s: time by which the IMU's stamps are late beyond what the calibration of its time offset corrects.
     """
 
     what: str
@@ -97,7 +98,7 @@ class RecordedCalibration:
 
     @cached_property
     def rig(self) -> Rig:
-        """The calibrated rig with its standard deviations; what was not calibrated is as in the file."""
+        """The calibrated rig with its standard deviations; all other parameters are those of the file."""
         refined = with_late_clock(self.batch.estimate.rig, self.clock_shift_s)
         if self.what == "all":
             return refined
@@ -118,20 +119,20 @@ class RecordedCalibration:
 
     @cached_property
     def findings(self) -> list[Finding]:
-        """What is known of each part that was calibrated."""
+        """The findings for each part that was calibrated."""
         of_file, of_others = (prior.covariance for prior in self._priors)
         both = zip(findings(self.batch.estimate, of_file), findings(self.batch.estimate, of_others), strict=True)
         return [found for found, other in both if (other.file_sigmas < 0.5 * found.file_sigmas).all()]
 
     @property
     def contradicted(self) -> list[Finding]:
-        """Parts that are kept as in the file though the recording contradicts it."""
+        """Findings for parts that are kept as in the file although the recording contradicts it there."""
         parts = {found.part for found in self.findings}
         return [found for found in self.all_findings if found.is_significant and found.part not in parts]
 
     @property
     def remarks(self) -> list[str]:
-        """What was found beyond the parts of the calibration, a sentence each."""
+        """Remarks on errors other than those of the calibration's parts, a sentence each."""
         if not self.clock_shift_s:
             return []
         return [
@@ -140,17 +141,17 @@ class RecordedCalibration:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether what is fixed as in the file does not show as an error of what is calibrated."""
+        """Whether the halves agree, so that errors of fixed parameters do not show in the others; True for ``all``."""
         return self.what == "all" or all(each.is_good for each in self.agreements)
 
     @property
     def is_complete(self) -> bool:
-        """Whether the recording shows every part that was calibrated, but for lengths, which hardly any shows."""
+        """Whether the recording determines every calibrated part, except lengths, which hardly any recording does."""
         return all(found.is_observed or found.motion == SCALE_MOTION for found in self.findings)
 
     @cached_property
     def agreements(self) -> list[HalfComparison]:
-        """How well the halves agree, group by group; empty for a short recording."""
+        """The agreement of the halves in each group of parameters; empty without halves."""
         if self.halves is None:
             return []
         difference, covariance = difference_of(*self.halves)
@@ -159,13 +160,13 @@ class RecordedCalibration:
 
     @cached_property
     def curves(self) -> list[Curve]:
-        """The parameters that were calibrated, as numbers for people."""
+        """The parameters that were calibrated, in units for display."""
         of_file, of_others = (prior.covariance for prior in self._priors)
         return [c for c in curves_of(self.file_rig) if c.row @ of_others @ c.row < 0.25 * (c.row @ of_file @ c.row)]
 
     @property
     def _priors(self) -> tuple[FilePrior, FilePrior]:
-        """Priors of the rig file, and the same with what is calibrated known: in that they differ."""
+        """Prior of the rig file, and the same prior with the parameters that are calibrated nearly fixed."""
         known = _with_fixed(self.file_rig, GROUPS[self.what])
         return file_prior(self.file_rig), file_prior(known)
 
@@ -181,18 +182,18 @@ def calibrate_recording(
     """Run the odometry over a recording, and calibrate its rig from all windows of the self-calibration.
 
     Args:
-        measurements: of the recording, in time order.
-        rig: of the rig file; its standard deviations are the prior.
+        measurements: measurements of the recording, in time order.
+        rig: the rig of the rig file; its standard deviations are the prior.
         what: one of `GROUPS`; other parameters are kept as in the file.
-        config: of the odometry.
-        on_progress: follows the work.
-        compares_halves: whether the two halves of the recording are calibrated by themselves as well.
+        config: configuration of the odometry.
+        on_progress: called with the progress of the work.
+        compares_halves: whether the two halves of the recording are also calibrated separately.
 
     Returns:
-        The calibrated rig, and what the recording showed of each parameter.
+        The calibrated rig, and the findings for each part of its calibration.
 
     Raises:
-        CalibrationError: if the rig cannot be calibrated so, or hardly moved.
+        CalibrationError: if the rig cannot be calibrated in this way, or hardly moved.
         RigError: if the stereo extrinsics are to be calibrated, and there is no pair.
     """
     if what == "stereo":
@@ -212,10 +213,10 @@ def calibrate_recording(
 
 
 def calibrating(config: Config) -> Config:
-    """Return a configuration of an odometry that estimates the calibration.
+    """Return the configuration of an odometry that estimates the calibration.
 
     Raises:
-        CalibrationError: if it cannot do so.
+        CalibrationError: if such an odometry cannot estimate the calibration.
     """
     config = replace(config, calibration=CalibrationConfig(online=True))
     if not config.estimates_calibration:
@@ -227,7 +228,7 @@ class CalibrationWindows:
     """Collects all windows of an odometry's self-calibration, from which the recording's rig is calibrated.
 
     Args:
-        odometry: that estimates the calibration, see `calibrating`, and has processed nothing yet.
+        odometry: odometry that estimates the calibration, see `calibrating`, and has processed nothing yet.
     """
 
     def __init__(self, odometry: Odometry) -> None:
@@ -243,8 +244,8 @@ class CalibrationWindows:
         Args:
             what: one of `GROUPS`.
             end_ns: stamp of the last frameset.
-            on_progress: follows the work.
-            compares_halves: whether the two halves of the recording are calibrated by themselves as well.
+            on_progress: called with the progress of the work.
+            compares_halves: whether the two halves of the recording are also calibrated separately.
 
         Raises:
             CalibrationError: if the rig hardly moved, or its calibration changed.
@@ -275,7 +276,7 @@ class CalibrationWindows:
 
 
 def _with_fixed(rig: Rig, names: Sequence[str]) -> Rig:
-    """Return a rig that is next to exactly known in some of its standard deviations."""
+    """Return a rig with some of its standard deviations reduced, so that these parameters are nearly fixed."""
     sigmas = rig.calibration_sigmas
     return replace(
         rig, calibration_sigmas=replace(sigmas, **{name: _FIXED_SHARE * getattr(sigmas, name) for name in names})

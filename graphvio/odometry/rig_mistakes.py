@@ -1,6 +1,6 @@
-"""Frequent mistakes in a rig, which the images of a pair show: left and right exchanged, transforms inverted.
+"""Detection of frequent mistakes in a rig from the images of a pair: left and right exchanged, transforms inverted.
 
-Such a pair finds next to none of its left image in its right one, and many with the mistake undone.
+Such a pair finds hardly any corner of its left image in its right one, and many with the mistake undone.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from graphvio.measurements.motion import VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Rig, StereoPair
 
-_CHECKED_AFTER = (10, 100)  # framesets in which few of a pair's corners have a depth
-_CHECKED_AGAIN = 10  # framesets with more, of which one is checked: a wrong calibration matches some corners, too
-_FEW_POINTS = 0.3  # of the corners; some always match something
+_CHECKED_AFTER = (10, 100)  # number of framesets with few depths after which a pair is checked
+_CHECKED_AGAIN = 10  # one in so many framesets with more is checked: a wrong calibration matches some, too
+_FEW_POINTS = 0.3  # share of the corners; some always match something
 _MIN_CORNERS = 30
 _MIN_MATCHES = 30
-_MAX_SHARE = 0.2  # of the corners that match as the rig is, of those that match with a mistake undone
+_MAX_SHARE = 0.2  # ratio of corners that match with the rig as it is to those with a mistake undone
 _EXCHANGED = "left and right are exchanged (cables, topics, or names in the rig file)"
 _INVERTED = "body_T_cam of both cameras is inverted, so that it maps points of the camera to body"
 
@@ -33,8 +33,8 @@ class RigMistakes:
     """Reports pairs whose images match only if a mistake in the rig is undone.
 
     Args:
-        rig: Of the rig file.
-        config: Of the front-end.
+        rig: The rig, with the calibration of the rig file.
+        config: Configuration of all stages.
         report: Receives one event for each such pair.
     """
 
@@ -48,11 +48,11 @@ class RigMistakes:
 
     @property
     def warnings(self) -> list[str]:
-        """Such pairs, a sentence each."""
+        """Warnings about such pairs, a sentence each."""
         return list(self._warnings.values())
 
     def update(self, frameset: FrameSet, visual: VisualResult) -> None:
-        """Check a pair that finds few of its corners in its right image, twice, and one that is mistaken again."""
+        """Check, twice, a pair that finds few of its corners in its right image; check again one that has a warning."""
         for j in self._pairs.keys() & frameset.images.keys() & visual.pairs.keys():
             seen = visual.pairs[j]
             if len(seen.pixels) < _MIN_CORNERS:
@@ -70,7 +70,7 @@ class RigMistakes:
                 self._report(frameset.stamp_ns, EventKind.RIG_MISTAKEN, self._warnings[j])
 
     def _check_again(self, j: int, frameset: FrameSet) -> None:
-        """Withdraw the warning of a pair whose images match as the rig is: somebody has plugged the cables right."""
+        """Withdraw the warning of a pair whose images match the rig again, as after cables were plugged correctly."""
         if j not in self._warnings:
             return
         if self._with_more_points[j] % _CHECKED_AGAIN == 0:
@@ -81,9 +81,9 @@ class RigMistakes:
         self._with_more_points[j] += 1
 
     def _mistakes(self, j: int, frameset: FrameSet) -> tuple[list[str], int]:
-        """Return the mistakes without which the images match, and how many corners match as the rig is.
+        """Return the mistakes without which the images match, and the number of corners that match without a change.
 
-        Mistakes may be the same, where body has a camera's axes.
+        Two mistakes may have the same effect, where body has a camera's axes.
         """
         pair = self._pairs[j]
         left, right = (np.ascontiguousarray(image) for image in frameset.images[j])
@@ -96,7 +96,7 @@ class RigMistakes:
         return mistakes, n_as_it_is
 
     def _matches(self, pair: StereoPair, left: Image, right: Image) -> int:
-        """Count the corners of a left image that have a depth by the right one."""
+        """Return the number of corners of a left image that are matched in the right one."""
         return int(GroupTracker(pair, self._config).observe(0, left, right, None, None).has_depth.sum())
 
 

@@ -1,4 +1,4 @@
-"""The calibration of a rig of single cameras, passed on from the estimator's window."""
+"""The online calibration of a rig of single cameras, which the state estimator's window estimates."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction, findings
 from graphvio.self_calibration.prior import file_prior
 
-_KEYFRAME_INTERVAL_S = 0.25  # of the windows for a calibration from the whole recording
+_KEYFRAME_INTERVAL_S = 0.25  # least interval in windows for a calibration from the whole recording
 
 
 class SinglesCalibration:
     """An `OnlineCalibration` of a rig of single cameras and an IMU, whose `MonocularEstimator` estimates it.
 
-    The cameras are passed on to the front-end, the time offset to the synchroniser, contradictions of the rig file to
-    people. Innovation tests and the pose's covariance know of the calibration's errors, since these are states.
+    It passes the cameras on to the front-end and the time offset to the synchroniser, and reports contradictions to the
+    rig file. Innovation tests and the pose's covariance already include the calibration's errors, which are states.
 
     Args:
-        rig: Of the rig file.
-        frontend: Has the tracks.
-        synchroniser: Takes a corrected time offset.
-        estimator: Estimates the calibration.
+        rig: The rig, with the calibration of the rig file.
+        frontend: Front-end, which has the tracks.
+        synchroniser: Receives a corrected time offset.
+        estimator: State estimator, which also estimates the calibration.
         report: Receives events.
     """
 
@@ -62,21 +62,21 @@ class SinglesCalibration:
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
-        """What is known of the calibration now, or None before the first pose."""
+        """The present estimate of the calibration, or None before the first pose."""
         return self._estimate
 
     @property
     def findings(self) -> list[Finding]:
-        """What is known of each part of the calibration; empty before the first pose."""
+        """The present findings for each part of the calibration; empty before the first pose."""
         return [] if self._estimate is None else findings(self._estimate, self._file_covariance)
 
     @property
     def warnings(self) -> list[str]:
-        """None: the estimator doubts a file that no motion fits."""
+        """An empty list: the estimator itself doubts a file that no motion fits."""
         return []
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Collect windows for a function from now on: the estimator's own are others."""
+        """Collect windows for a function from now on; they are not the windows of the estimator."""
         self._on_full_window = on_window
 
     def add_sample(self, sample: ImuSample) -> None:
@@ -85,18 +85,18 @@ class SinglesCalibration:
             self._collector.add_sample(sample)
 
     def restart_imu(self) -> None:
-        """Forget what was learnt by another clock."""
+        """Forget the calibration and samples of the wrong clock, and use the rig file's calibration again."""
         self._use_rig_file()
         self._estimate, self._was_wrong = None, False
         self._collector.restart()
         self._collector.forget_samples()
 
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
-        """Return what vision measured, as it is: the window allows for errors of the calibration."""
+        """Return the front-end's result unchanged: the window allows for errors of the calibration."""
         return visual
 
     def add(self, stamp_ns: int, quality: Quality, status: Status) -> None:
-        """Record how the stamps jitter, and add a frameset for the windows."""
+        """Pass the stamps' jitter to the estimator, and add a frameset to the windows."""
         self._estimator.note_stamps(self._synchroniser.stamp_sigma_s)
         if self._on_full_window is None:
             return
@@ -106,14 +106,14 @@ class SinglesCalibration:
         if self._estimator.epoch != self._epoch:
             self._epoch = self._estimator.epoch
             self._collector.restart()
-        if status is not Status.TRACKING or not self._estimator.has_pose:  # which a wrong clock may have ended since
+        if status is not Status.TRACKING or not self._estimator.has_pose:  # a wrong clock may have ended the pose since
             return
         views = views_at(self._frontend, stamp_ns)
         if self._collector.is_keyframe(stamp_ns, views, _KEYFRAME_INTERVAL_S):
             self._collector.add(stamp_ns, self._estimator.state().nav_T_body, views)
 
     def update(self, stamp_ns: int) -> None:
-        """Pass on what has been found since the last call; body stays where it is."""
+        """Pass on the calibration if it has changed since the last call; body is not turned."""
         estimate = self._estimator.calibration
         if estimate is None or estimate is self._estimate:
             return
@@ -130,7 +130,7 @@ class SinglesCalibration:
         self._was_wrong = wrong is not None
 
     def correct_pose(self, turned: Float) -> None:
-        """Do nothing: `update` asks for no change of the pose."""
+        """Do nothing: `update` never changes the pose."""
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
         """Return zero: the state's covariance already includes errors of the calibration."""
@@ -140,7 +140,7 @@ class SinglesCalibration:
         """Do nothing: nothing runs beside the odometry."""
 
     def _use_rig_file(self) -> None:
-        """Let the front-end track by the rig file, and find points of other cameras as far off as that may be wrong."""
+        """Let the front-end use the rig file, and search matches in other cameras within the file's possible error."""
         sigmas = self._rig.calibration_sigmas
         focal_px = max(single.left.focal_px for single in self._rig.singles)
         self._frontend.recalibrate(self._rig, sigmas.epipolar_margin_px(focal_px, sigmas.pair_rotation_deg))

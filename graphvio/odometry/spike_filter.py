@@ -1,4 +1,4 @@
-"""Leaves out single IMU samples that are far from both neighbours, such as errors of a transmission."""
+"""A filter that leaves out single IMU samples far from both neighbours, such as transmission errors."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from graphvio.backend.inertial import value_fault
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import ImuSample
 
-_OVER_MEAN, _OVER_NEIGHBOURS = 10.0, 4.0  # real flights do not reach half of this, with all their vibration
+_OVER_MEAN, _OVER_NEIGHBOURS = 10.0, 4.0  # the vibration of real flights does not reach half of this
 _MIN_RATE, _MIN_FORCE = 0.2, 1.0  # rad/s and m/s^2
-_MIN_SAMPLES, _GAIN = 20, 0.02  # of the mean change from sample to sample
-_MAX_STEP_NS = 8_000_000  # between samples: a real shock may be that short
-_MAX_LEFT_OUT = 0.1  # of the samples: what comes that often is measured
+_MIN_SAMPLES, _GAIN = 20, 0.02  # samples until the mean change is known, and gain of its filter
+_MAX_STEP_NS = 8_000_000  # between samples: a real shock may be shorter than that
+_MAX_LEFT_OUT = 0.1  # share of the samples: changes that frequent are real
 
 _Readings = tuple[list[float], list[float]]  # rate and force
-_Change = tuple[float, float]  # of rate, rad/s, and force, m/s^2
+_Change = tuple[float, float]  # change of rate, rad/s, and of force, m/s^2
 _NONE: _Change = (0.0, 0.0)
 
 
 class SpikeFilter:
-    """Passes IMU samples on; one that is far from the one before is held until the next one shows which is wrong.
+    """Passes IMU samples on; a sample far from the previous one is held until the next one shows which is wrong.
 
-    A spike is much farther from both neighbours than these are from each other, than the last three before it are from
-    each other, and than samples change in the mean: shocks and vibrations, which last for longer than a sample or come
-    again, are none. Where samples are more than 8 ms apart, nothing is held.
+    A spike is much farther from both neighbours than these are from each other, than the last three samples before it
+    are from each other, and than samples change on average: so shocks and vibrations, which last longer than one sample
+    or recur, are not spikes. Where samples are more than 8 ms apart, nothing is held.
 
     Args:
         report: Receives an event for each sample that is left out.
@@ -32,15 +32,15 @@ class SpikeFilter:
 
     def __init__(self, report: Report) -> None:
         self._report = report
-        self._newest: ImuSample | None = None  # of those that were passed on
-        self._readings: _Readings = ([], [])  # its, as numpy is slow for three
+        self._newest: ImuSample | None = None  # newest of the samples that were passed on
+        self._readings: _Readings = ([], [])  # its readings as lists, as numpy is slow for three numbers
         self._suspect: ImuSample | None = None
-        self._mean: _Change = _NONE  # change from sample to sample
+        self._mean: _Change = _NONE  # mean change from sample to sample
         self._last: tuple[_Change, _Change] = (_NONE, _NONE)
         self._count, self._left_out = 0, 0.0  # samples, and the recent share of those that were left out
 
     def confirm(self, sample: ImuSample) -> list[ImuSample]:
-        """Add a sample, and return those that may be used now, in time order, with those that no sensor reads."""
+        """Add a sample, and return those to be passed on now, in time order, including samples with a `value_fault`."""
         readings = _readings(sample)
         if self._newest is None:
             if not value_fault(sample):
@@ -52,10 +52,10 @@ class SpikeFilter:
         if may_be_faulty and value_fault(sample):
             return [sample]
         if sample.stamp_ns <= self._newest.stamp_ns:
-            return [sample]  # which is refused
+            return [sample]  # the buffer refuses it
         confirmed = []
         if self._suspect is not None:
-            if sample.stamp_ns <= self._suspect.stamp_ns:  # it would be taken before the one that is held
+            if sample.stamp_ns <= self._suspect.stamp_ns:  # it would be passed on before the held sample
                 is_copy = sample.stamp_ns == self._suspect.stamp_ns
                 kind = EventKind.IMU_DUPLICATE_STAMP if is_copy else EventKind.IMU_BACKWARD_STAMP
                 self._report(sample.stamp_ns, kind, "sample left out")
@@ -71,12 +71,12 @@ class SpikeFilter:
         return confirmed
 
     def end(self) -> list[ImuSample]:
-        """Return the sample that is held, as none follows that could judge it."""
+        """Return the sample that is held, if any, as no sample follows to decide about it."""
         suspect, self._suspect = self._suspect, None
         return [] if suspect is None else [suspect]
 
     def _judged(self, suspect: ImuSample, after: ImuSample) -> list[ImuSample]:
-        """Return a sample that is far from the one before, or nothing where it is far from the one after as well."""
+        """Return the held sample, or nothing where it is far from the next sample as well."""
         self._suspect = None
         readings, next_ones = _readings(suspect), _readings(after)
         into, out_of = _change(self._readings, readings), _change(readings, next_ones)
@@ -92,7 +92,7 @@ class SpikeFilter:
         return [suspect]
 
     def _are_far(self, change: _Change, neighbours: _Change) -> bool:
-        """Whether rate or force change by much more than they do in the mean, and than neighbours do."""
+        """Whether rate or force change by much more than on average, and than the neighbours' changes."""
         if self._count < _MIN_SAMPLES:
             return False
         rate = max(_MIN_RATE, _OVER_MEAN * self._mean[0], _OVER_NEIGHBOURS * neighbours[0])
@@ -100,7 +100,7 @@ class SpikeFilter:
         return change[0] > rate or change[1] > force
 
     def _note(self, sample: ImuSample, readings: _Readings, change: _Change) -> None:
-        """Pass a sample on, with its readings and their change from the ones before."""
+        """Record a sample that is passed on, with its readings and their change from the previous ones."""
         self._count += 1
         gain = max(1.0 / self._count, _GAIN)
         rate, force = self._mean
@@ -114,7 +114,7 @@ def _readings(sample: ImuSample) -> _Readings:
 
 
 def _change(first: _Readings, second: _Readings) -> _Change:
-    """Return by how much angular velocity and specific force differ."""
+    """Return the distances between two angular velocities and between two specific forces."""
     return dist(first[0], second[0]), dist(first[1], second[1])
 
 

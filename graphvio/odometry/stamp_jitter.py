@@ -1,7 +1,7 @@
-"""Jitter of framesets' stamps, as of cameras whose images are stamped when they arrive.
+"""Estimation of the jitter of framesets' stamps, as of cameras whose images are stamped when they arrive.
 
-Stamps of a camera that runs freely are whole periods apart. By how much they are not is how much each stamp errs, and
-with it the interval over which the IMU is integrated.
+Images of a free-running camera are taken whole periods apart. The deviation of the stamps from that is their error, and
+thereby the error of the interval over which the IMU is integrated.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from statistics import median
 
 _STAMPS = 40
 _MIN_STAMPS = 5
-_MAX_SHARE = 0.2  # of the period: what scatters more has no period
-_NORMAL_MEDIAN = 0.6745  # of the magnitude of a normal deviate
+_MAX_SHARE = 0.2  # scatter as a share of the period: stamps with more have no period
+_NORMAL_MEDIAN = 0.6745  # median of the magnitude of a normal deviate
 
 
 class StampJitter:
@@ -29,9 +29,9 @@ class StampJitter:
         """Add the stamp of the next frameset, some of which may be missing.
 
         Args:
-            stamp_ns: of the frameset.
-            group: a pair or single camera that it has images of. Pairs that are triggered one after the other come in
-                framesets of their own.
+            stamp_ns: stamp of the frameset.
+            group: a pair or single camera of which it has images. Pairs that are triggered one after the other come in
+                separate framesets.
         """
         self._stamps[group].append(stamp_ns)
         self._sigma_s = None
@@ -47,7 +47,7 @@ class StampJitter:
 
 
 def _errors_s(stamps_ns: Sequence[int]) -> list[float]:
-    """Return by how much intervals between stamps (N,) are not whole periods (N - 1,), zeros if there is no period."""
+    """Return the deviations (N - 1,) of intervals between stamps (N,) from whole periods; zeros without a period."""
     intervals = [1e-9 * (end - begin) for begin, end in pairwise(stamps_ns)]  # numpy is slow for so few
     one = sorted(intervals)[len(intervals) // 4]  # some framesets may be missing
     periods = [max(round(interval / one), 1) for interval in intervals]

@@ -1,4 +1,4 @@
-"""A step of the odometry with all that went into it, for those who subscribe to steps: recorders and SLAM."""
+"""A step of the odometry with all its inputs, for subscribers such as recorders and SLAM."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ class NewKeyframe:
     """A frameset from which later motions are measured.
 
     Attributes:
-        frames: Index of the pair or camera -> its tracks.
+        frames: Index of a pair or single camera -> its tracks.
         images: The same index -> (left, right) of a pair, (image,) of a single camera.
-        body_T_left: (P, 4, 4) of all pairs and single cameras, with the corrections that are in force.
-        previous_ns: Stamp of the keyframe before, or None.
-        previous_T_body: (4, 4) motion since the keyframe before, or None if it is not known.
-        covariance: (6, 6) of that motion, tangent ``[rotation, translation]`` in body, or None with it.
-        located_points: Called within the step, returns the points of single cameras that the state locates, by camera.
+        body_T_left: (P, 4, 4) extrinsics of all left and single cameras, with the corrections that are in force.
+        previous_ns: Stamp of the previous keyframe, or None.
+        previous_T_body: (4, 4) motion since the previous keyframe, or None if it is not known.
+        covariance: (6, 6) covariance of that motion, tangent ``[rotation, translation]`` in body, or None without it.
+        located_points: Function, to be called within the step, that returns the points of single cameras that the state
+            estimator locates, by camera index.
     """
 
     frames: Mapping[int, TrackedFrame]
@@ -37,18 +38,18 @@ class NewKeyframe:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What the odometry measured at a frameset, and the estimate that results.
+    """The odometry's measurements at a frameset, and the resulting estimate.
 
     Attributes:
         estimate: The estimate as `graphvio.Odometry.process` returns it.
         motion: The relative motion that constrains the state, or else a refused one of good quality; otherwise None.
         used: Whether the motion passed the gate.
-        interval: The IMU since the step before, or None.
-        initialised: Whether the state was initialised or reinitialised here: earlier steps do not count any more.
+        interval: The IMU readings since the previous step, or None.
+        initialised: Whether the state was initialised or reinitialised here: earlier steps no longer constrain it.
         references: Stamps of the framesets that later motions are measured from.
-        own: Pair index -> its own motion, at the end of a keyframe whose motion is used.
+        own: Pair index -> the motion by this pair alone, at the end of a keyframe whose motion is used.
         keyframe: The frameset's data if later motions are measured from it, or None.
-        partial_motion: Where there is no motion, what few points show of it, if it was used; otherwise None.
+        partial_motion: Where there is no motion, the motion by a few points, if it was used; otherwise None.
     """
 
     estimate: Estimate

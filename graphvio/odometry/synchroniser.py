@@ -1,4 +1,4 @@
-"""Brings IMU and framesets together: a frameset is held until the IMU samples that cover it have come."""
+"""Synchronisation of IMU and framesets: a frameset is held until the IMU samples that cover it have come."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from graphvio.odometry.stamp_jitter import StampJitter
 from graphvio.rig import Rig
 from graphvio.self_calibration.imu_correction import ImuCorrection
 
-_KEPT_NS = 6_000_000_000  # of the IMU, for `Synchroniser.mean_readings`
-_MIN_INTERVAL_NS = 1_000_000  # framesets that are closer are of one instant
-_MAX_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
+_KEPT_NS = 6_000_000_000  # IMU samples of this time are kept for `Synchroniser.mean_readings`
+_MIN_INTERVAL_NS = 1_000_000  # framesets closer than this belong to one instant
+_MAX_SILENT_WAITS = 2.0  # multiple of the longest wait: an IMU farther behind is not waited for
 _MAX_JUMP_NS = 5_000_000_000
-_MIN_COVERED = 0.95  # share of the time from which the state is initialised: samples may be missing at its ends
+_MIN_COVERED = 0.95  # share of the time for an initialisation: samples may be missing at its ends
 
 
 class HasStamp(Protocol):
@@ -38,15 +38,15 @@ Stamped = TypeVar("Stamped", bound=HasStamp)
 
 
 class Synchroniser:
-    """Framesets in time order, each with the IMU up to its instant, or to the last line of a rolling shutter.
+    """Holds framesets in time order until the IMU covers each up to its instant, or a rolling shutter's last line.
 
     Args:
-        rig: Has the number of pairs, and the time offset of an IMU if there is one.
-        config: Says how long framesets wait for the IMU.
+        rig: The rig, with its groups of cameras, and the time offset of its IMU if there is one.
+        config: Configuration, with the times for which framesets wait for the IMU.
         report: Receives an event for each measurement that is left out.
 
     Attributes:
-        imu_correction: Applied to all readings that are returned from now on.
+        imu_correction: Correction that is applied to all readings that are returned from now on.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
@@ -54,9 +54,9 @@ class Synchroniser:
         self._has_imu = rig.imu is not None
         self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
         self._nominal_ns = self._offset_ns
-        self._clock_ns = 0  # by which the IMU's stamps are taken to be earlier than they come
-        self._lateness_ns: dict[int, int] = {}  # by group
-        self._instants_ns: dict[int, int] = {}  # of framesets whose stamps are late, by stamp
+        self._clock_ns = 0  # subtracted from the stamps of the IMU's samples
+        self._lateness_ns: dict[int, int] = {}  # group -> time by which its stamps are late
+        self._instants_ns: dict[int, int] = {}  # stamp of a frameset -> instant of its images, if different
         self._newest_instant_ns: int | None = None
         self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._timing = config.timing
@@ -72,18 +72,18 @@ class Synchroniser:
         self._frameset_jumps: StampJumpFilter[FrameSet] = StampJumpFilter(EventKind.FRAMESET_FUTURE_STAMP, report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
-        """Add an IMU sample, and return those that are usable now, as they were measured but for their clock."""
+        """Add an IMU sample, and return those that are usable now; only their stamps are corrected for a clock jump."""
         if self._clock_ns:
             sample = replace(sample, stamp_ns=sample.stamp_ns - self._clock_ns)
         passed = [each for confirmed in self._sample_jumps.confirm(sample) for each in self._spikes.confirm(confirmed)]
         return self._usable(passed)
 
     def last_samples(self) -> list[ImuSample]:
-        """Return the samples that the spike filter has held back, when no other follows."""
+        """Return the samples that the spike filter still holds, when no other sample follows."""
         return self._usable(self._spikes.end())
 
     def _usable(self, samples: list[ImuSample]) -> list[ImuSample]:
-        """Keep samples, and return those without a fault."""
+        """Add samples to the buffer, and return those without a fault."""
         usable = []
         for sample in samples:
             fault = self._imu.add(sample)
@@ -99,10 +99,11 @@ class Synchroniser:
         return sample.stamp_ns - self._offset_ns, values
 
     def add_frameset(self, frameset: FrameSet) -> None:
-        """Add a frameset to those that are held for the IMU; it has to be newer than those before it.
+        """Add a frameset to those that are held for the IMU; it has to be newer than the previous ones.
 
-        Pairs may come in framesets of their own: less than 1 ms after a frameset that is still held, other pairs join
-        it. A frameset so soon after one that has been processed, or with pairs that it has already, is left out.
+        Pairs may come in separate framesets: one of other pairs, less than 1 ms after a frameset that is still held, is
+        merged with it. A frameset so soon after one that has been processed, or after one with the same pairs, is left
+        out.
         """
         for confirmed in self._frameset_jumps.confirm(frameset):
             self._add(confirmed)
@@ -128,7 +129,7 @@ class Synchroniser:
         self._held.append(frameset)
 
     def _joins(self, frameset: FrameSet) -> bool:
-        """Whether a frameset brings other pairs of the same instant as the newest one, which is held."""
+        """Whether a frameset has other pairs of the same instant as the newest frameset, which is still held."""
         return (
             bool(self._held)
             and abs(frameset.stamp_ns - self._held[-1].stamp_ns) < _MIN_INTERVAL_NS
@@ -162,16 +163,16 @@ class Synchroniser:
         return frameset
 
     def _expected_instant_ns(self, frameset: FrameSet) -> int:
-        """Return when the images of a frameset were taken, by the stamps of the first group."""
+        """Return the instant at which a frameset's images were taken, on the clock of the first group."""
         group = next(iter(frameset.images)) if len(frameset.images) == 1 else -1
         return frameset.stamp_ns - self._lateness_ns.get(group, 0)
 
     def set_lateness(self, group: int, seconds: float) -> None:
-        """Set by how much the stamps of a group's own framesets are late, for those that are processed from now on."""
+        """Set the time by which stamps of a group's separate framesets are late, for all processed from now on."""
         self._lateness_ns[group] = round(seconds * 1e9)
 
     def instant_ns(self, stamp_ns: int) -> int:
-        """Return when the images of a frameset were taken: its stamp, but for what `set_lateness` has corrected."""
+        """Return the instant at which a frameset's images were taken: its stamp, corrected as by `set_lateness`."""
         return self._instants_ns.get(stamp_ns, stamp_ns)
 
     def stamp_ns(self, instant_ns: int) -> int:
@@ -179,39 +180,39 @@ class Synchroniser:
         return next((stamp_ns for stamp_ns, at_ns in self._instants_ns.items() if at_ns == instant_ns), instant_ns)
 
     def finish(self) -> None:
-        """Leave out what was not confirmed, as no measurement follows."""
+        """Leave out the measurements that were not confirmed, as no other follows."""
         self._sample_jumps.end()
         self._frameset_jumps.end()
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two framesets, by their stamps, or None where it does not cover them."""
+        """Return the IMU readings between two framesets, given by their stamps, or None where samples are missing."""
         return self._interval(self.instant_ns(start_ns) + self._offset_ns, self.instant_ns(end_ns) + self._offset_ns)
 
     def interval_after(self, stamp_ns: int, duration_ns: int) -> ImuInterval | None:
-        """Return the IMU from a frameset on, or None where it does not cover it."""
+        """Return the IMU readings for a duration after a frameset, or None where they do not cover it."""
         start_ns = self.instant_ns(stamp_ns) + self._offset_ns
         return self._interval(start_ns, start_ns + duration_ns)
 
     def nominal_interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the IMU between two stamps by the rig's time offset, whatever has been found of the clocks."""
+        """Return the IMU readings between two stamps with the rig's time offset, without corrections of the clocks."""
         return self._interval(start_ns + self._nominal_ns, end_ns + self._nominal_ns)
 
     def _interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """Return the corrected IMU between two of its stamps, or None where it does not cover them."""
+        """Return the corrected readings between two stamps of the IMU, or None where they do not cover the interval."""
         interval = self._imu.interval(start_ns, end_ns)
         if interval is None:
             return None
         return self.imu_correction.applied_to(replace(interval, stamp_sigma_s=self.stamp_sigma_s))
 
     def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
-        """Return the IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
+        """Return the IMU readings from a frameset on, with stamps on the framesets' clock; see `ImuBuffer.since`."""
         stamps, values = self._imu.since(self.instant_ns(stamp_ns) + self._offset_ns)
         return stamps - self._offset_ns, self.imu_correction.applied(values)
 
     def initial_interval(self, stamp_ns: int) -> tuple[ImuInterval, float] | None:
-        """Return the IMU around a frameset and the frameset's place in it in seconds, once it is long enough.
+        """Return the IMU readings around a frameset, once they cover enough time, and the frameset's time in them, s.
 
-        What came beyond that is left out, so that the result does not depend on how early samples come.
+        Later samples are left out, so that the result does not depend on how early samples come.
         """
         at_ns = self.instant_ns(stamp_ns) + self._offset_ns
         window_ns, min_ns = (round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s))
@@ -231,13 +232,14 @@ class Synchroniser:
         return None
 
     def mean_readings(self) -> MeanReadings:
-        """Return the means of the samples that are kept, not corrected, by the framesets' clock."""
+        """Return the means of the samples in the buffer, uncorrected, with stamps on the framesets' clock."""
         return self._imu.means(self._offset_ns)
 
     def correct_imu_clock(self, late_s: float) -> None:
-        """Correct a jump of the IMU's clock: samples to come are stamped so many seconds earlier, kept ones dropped.
+        """Correct a jump of the IMU's clock: later samples are stamped ``late_s`` earlier, those in the buffer dropped.
 
-        In contrast to `add_to_time_offset`, this is for a clock that has jumped, or is off by more than a calibration.
+        In contrast to `add_to_time_offset`, this is for a clock that has jumped, or is wrong by more than a calibration
+        corrects.
         """
         self._clock_ns += round(late_s * 1e9)
         self._imu = ImuBuffer(self._timing.max_imu_gap_ms)
@@ -245,7 +247,7 @@ class Synchroniser:
         self._spikes = SpikeFilter(self._report)
 
     def add_to_time_offset(self, seconds: float) -> None:
-        """Correct the time offset of the IMU from the framesets by so many seconds more; the samples are kept."""
+        """Add ``seconds`` to the offset of the IMU's stamps from the framesets'; the samples in the buffer are kept."""
         self._offset_ns += round(seconds * 1e9)
 
     @property
@@ -279,7 +281,7 @@ class Synchroniser:
             if self.precedes_imu(frameset.stamp_ns):
                 return True
             enough = self.initial_interval(frameset.stamp_ns) is not None
-            if self._readout_ns:  # its lines need the IMU, too
+            if self._readout_ns:  # the readout of its lines has to be covered, too
                 enough &= self.interval_after(frameset.stamp_ns, self._readout_ns) is not None
             return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
         at_ns, newest_ns = self._expected_instant_ns(frameset) + self._offset_ns, self._imu.newest_ns
@@ -291,7 +293,7 @@ class Synchroniser:
 
 
 class StampJumpFilter(Generic[Stamped]):
-    """Accepts a jump of the clock only when a second stamp confirms it: a single wrong stamp is left out.
+    """Accepts a jump of the clock only when a second stamp confirms it; leaves out a single wrong stamp.
 
     Args:
         kind: Kind of the event for a measurement that is left out.
@@ -319,7 +321,7 @@ class StampJumpFilter(Generic[Stamped]):
         return [measurement]
 
     def end(self) -> None:
-        """Leave out what was not confirmed, as nothing follows."""
+        """Leave out the measurement that was not confirmed, as nothing follows."""
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
             self._leave_out(suspect)

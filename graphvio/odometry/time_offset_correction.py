@@ -10,17 +10,17 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 
 _MIN_REPORTED_S = 1e-3
-_MIN_SIGMAS = 5.0  # of a difference that is reported
+_MIN_SIGMAS = 5.0  # significance of a difference from the rig that is reported
 
 
 class TimeOffsetCorrection:
     """Corrects the synchroniser's time offset once it is known well enough.
 
     Args:
-        rig: Has the nominal offset.
-        config: Says whether the offset is estimated at all.
-        synchroniser: Gets the corrections.
-        report: Receives one event if the offset is not the rig's.
+        rig: The rig, with the nominal offset.
+        config: Configuration, which says whether the offset is estimated at all.
+        synchroniser: Receives the corrections.
+        report: Receives one event if the offset differs from the rig's.
     """
 
     def __init__(self, rig: Rig, config: Config, synchroniser: Synchroniser, report: Report) -> None:
@@ -44,7 +44,7 @@ class TimeOffsetCorrection:
         return None if self._filter is None else self._filter.estimate.sigma_s
 
     def update(self, stamp_ns: int, visual: VisualResult) -> None:
-        """Estimate the offset from a frameset's motion, and correct it."""
+        """Update the estimate of the offset with a frameset's motion, and correct the offset."""
         if self._filter is None or visual.motion is None or visual.quality is not Quality.GOOD:
             return
         self._filter.update(visual.motion)

@@ -1,4 +1,4 @@
-"""Events that the front-end gives rise to: failures, frozen cameras, pairs that are not where the rig has them."""
+"""Events caused by the front-end's results: failures, frozen cameras, pairs whose extrinsics are wrong."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.rig import Rig, StereoPair
 
 _UNUSED_NS = 5_000_000_000
-_MIN_MOTIONS = 40  # good ones, from which on a pair that took part in none is a warning
+_MIN_MOTIONS = 40  # good motions after which a pair that took part in none is reported
 
 
 class VisionEvents:
-    """Reports each failure of vision, and once each state that lasts.
+    """Reports each failure of vision, and lasting conditions once each.
 
     Args:
         rig: Rig whose pairs are named.
@@ -28,18 +28,18 @@ class VisionEvents:
         self._extrinsic_errors: Mapping[int, ExtrinsicError] = {}
         self._reported: set[int] = set()
         self._stereo = {j for j, group in enumerate(rig.groups) if isinstance(group, StereoPair)}
-        self._used_ns: dict[int, int] = {}  # pair -> when it last took part in a motion, or its first images
-        self._motions: dict[int, int] = dict.fromkeys(self._stereo, 0)  # good ones while it had images
+        self._used_ns: dict[int, int] = {}  # pair -> stamp of its last motion, or of its first images
+        self._motions: dict[int, int] = dict.fromkeys(self._stereo, 0)  # pair -> good motions while it had images
         self._is_used: set[int] = set()
         self._unused: set[int] = set()  # reported
 
     def update(self, stamp_ns: int, visual: VisualResult, extrinsic_errors: Mapping[int, ExtrinsicError]) -> None:
-        """Report what is new with a frameset.
+        """Report failures and new conditions at a frameset.
 
         Args:
             stamp_ns: Stamp of the frameset.
             visual: The front-end's result for it.
-            extrinsic_errors: Pair index -> error of its extrinsics that motions are corrected for.
+            extrinsic_errors: Pair index -> error of its extrinsics, for which motions are corrected.
         """
         if visual.quality is not Quality.GOOD:
             failed = visual.quality is Quality.FAILED
@@ -77,7 +77,7 @@ class VisionEvents:
 
     @property
     def rig_warnings(self) -> list[str]:
-        """Where the motions contradict the rig: a sentence each, with the size and one standard deviation."""
+        """Warnings where the motions contradict the rig, a sentence each, with the size and one standard deviation."""
         return [self._warning(j, error) for j, error in sorted(self._extrinsic_errors.items())] + [
             f"{self._rig.groups[j].name}: took part in none of {motions} motions that other cameras saw; check its "
             "images, which camera is left and which right, and its calibration (graphvio rig)"

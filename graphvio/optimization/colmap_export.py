@@ -26,10 +26,10 @@ from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
 
 Progress = Callable[[str, int, int], None]
-"""Called with the kind of item, the number of finished ones and of all."""
+"""Called with the kind of item, the number of finished items and the total number."""
 
 _IMAGES = "images"
-_REFINEMENTS = 2  # COLMAP's default of 5 takes half as long again, and moves nothing by 0.001 px
+_REFINEMENTS = 2  # COLMAP's default of 5 takes half as long again, and changes nothing by as much as 0.001 px
 
 
 def export(
@@ -42,15 +42,15 @@ def export(
 ) -> None:
     """Write images as ``images/SESSION/CAMERA/STAMP.png``, and models as ``sparse/0``, ``sparse/1`` and so on.
 
-    Each frame of the optimisation becomes a model, as COLMAP does for unconnected ones; that with most places comes
-    first. Models of an earlier export are removed.
+    Each frame of the optimisation becomes a model, as COLMAP makes one for each unconnected part; the frame with most
+    places comes first. Models of an earlier export are removed.
 
     Args:
-        optimization: of the sessions, in the same order.
-        sessions: whose places are in the database.
-        database: of features; neighbouring places are matched, and matches verified by the optimised poses.
-        folder: to write to, made if missing.
-        config: gives the seed.
+        optimization: the solution of the sessions, in the same order.
+        sessions: the sessions, whose places are in the database.
+        database: the features; neighbouring places are matched in it, and matches verified by the optimised poses.
+        folder: the folder to write to, made if missing.
+        config: the configuration, which gives the random seed.
         on_progress: called after each item.
 
     Raises:
@@ -99,14 +99,14 @@ def _by_frame(
 
 
 class _ImageWriter:
-    """Writes the images of all places of which a file is missing, beside the triangulation, which has one thread."""
+    """Writes the images of places with a missing file, in a thread beside the triangulation, which uses one thread."""
 
     def __init__(self, sessions: Sequence[SessionInput], database: FeatureDatabase, folder: Path) -> None:
         self._folder = folder / _IMAGES
         self._folder.mkdir(parents=True, exist_ok=True)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="graphvio-images")
         places = [(session, place) for session in sessions for place in session.places]
-        names = [_names(session, place, database) for session, place in places]  # the database is for this thread
+        names = [_names(session, place, database) for session, place in places]  # the database is only for this thread
         self._writing = [self._pool.submit(self._write, *each) for each in zip(places, names, strict=True)]
 
     def __enter__(self) -> Self:
@@ -116,7 +116,7 @@ class _ImageWriter:
         self._pool.shutdown(cancel_futures=True)
 
     def wait(self, on_progress: Callable[[int, int], None]) -> None:
-        """Wait until all are written.
+        """Wait until all images are written.
 
         Raises:
             SourceError: if an image cannot be read.
@@ -134,7 +134,7 @@ class _ImageWriter:
 def _posed(
     optimization: Optimization, sessions: Sequence[SessionInput], places: Sequence[Place], database: FeatureDatabase
 ) -> Any:
-    """Return a reconstruction of the places of a frame, without points."""
+    """Return a reconstruction with the poses of the places of a frame, without points."""
     rigs: dict[int, Float] = {}
     for place in places:
         session = sessions[place.session]
@@ -148,7 +148,7 @@ def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: P
     """Triangulate the database's verified matches, with poses and cameras held fixed; points have no colours yet."""
     library = colmap()
     options = library.IncrementalPipelineOptions()
-    options.num_threads = 1  # with more, points depend on their timing
+    options.num_threads = 1  # with more threads, points depend on timing
     options.random_seed = config.motion.seed
     options.image_names = sorted(image.name for image in model.images.values())
     options.load_all_images = True
@@ -158,7 +158,7 @@ def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: P
     options.constant_cameras = set(model.cameras)
     options.triangulation.ignore_two_view_tracks = False  # two views of a calibrated stereo pair suffice
     try:
-        with only_errors_logged():  # not that images are missing, which are being written
+        with only_errors_logged():  # no warnings of missing images, which are still being written
             triangulated = library.triangulate_points(model, database.path, folder / _IMAGES, target, True, options)
         triangulated.update_point_3d_errors()
     except (RuntimeError, ValueError) as error:
@@ -167,7 +167,7 @@ def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: P
 
 
 def _write(model: Any, images: Path, target: Path) -> None:
-    """Colour a model's points by the images, and write it."""
+    """Colour a model's points from the images, and write the model."""
     try:
         model.extract_colors_for_all_images(images)
         model.write(target)

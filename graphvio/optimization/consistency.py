@@ -1,9 +1,9 @@
 """Selection of loop closures that are consistent with the odometry and with each other.
 
-Fragments, the epochs of all sessions, are first joined by the transforms on which most closures between them agree.
-Outliers are then rejected by graduated non-convexity (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, RA-L 2020) in a
-graph of the closures' end states only: the odometry between two of them is one factor with its covariance in the full
-graph.
+A fragment is one epoch of a session. Fragments are first joined by the transform on which most closures between them
+agree. Outliers are then rejected by graduated non-convexity (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, RA-L 2020)
+in a graph that has only the states in which closures end: the odometry between two such states is one factor, with its
+covariance from the full graph.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from graphvio.backend.noise import isotropic
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.solver import Edge, KnownMotions, Marginals
 
-_MAX_DIFFERENCE_M = 0.5  # of closures that agree
+_MAX_DIFFERENCE_M = 0.5  # between the transforms of closures that agree
 _MAX_DIFFERENCE_RAD = 0.1
 _MIN_VOTES = 3
-_MIN_POINTS = 100  # of a closure that votes: fewer may be of one object that two places have in common
+_MIN_POINTS = 100  # inliers of a closure that votes: fewer may be on one object that two places have in common
 _FRAME_SIGMA = 1e-6
-_JOINED_SIGMAS = np.repeat([_MAX_DIFFERENCE_RAD, _MAX_DIFFERENCE_M], 3)  # of the transforms by vote
+_JOINED_SIGMAS = np.repeat([_MAX_DIFFERENCE_RAD, _MAX_DIFFERENCE_M], 3)  # of the transforms found by vote
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """Fragments in common frames."""
+    """The transforms of fragments into common frames."""
 
     frames: list[Float]  # ``frame_T_nav`` (4, 4) of each fragment
-    component: list[int]  # for each fragment, the fragment whose nav frame is its frame
+    component: list[int]  # for each fragment, the one whose nav frame is the common frame
 
 
 def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edge], inliers: Sequence[int]) -> Joined:
-    """Transform fragments that loop closures join into the frame of the first of them.
+    """Transform each group of fragments that loop closures join into the frame of the group's first fragment.
 
     Args:
-        fragments: states of each.
-        poses: (N, 4, 4) of all states, in their fragments' nav frames.
+        fragments: states of each fragment.
+        poses: poses (N, 4, 4) of all states, in their fragments' nav frames.
         edges: true and false loop closures.
-        inliers: points of each loop closure.
+        inliers: number of points of each loop closure.
     """
     of = fragment_of(fragments)
     frames = [np.eye(4) for _ in fragments]
@@ -95,18 +95,18 @@ def consistent(
 ) -> tuple[Bool, Float]:
     """Return which loop closures (L,) are consistent with the odometry and with each other, and squared distances (L,).
 
-    A distance, with 6 degrees of freedom, is that from the odometry, or between fragments from their joined transform;
-    NaN where they are not joined.
+    A distance is a squared Mahalanobis distance with 6 degrees of freedom: of a closure within a fragment, from the
+    odometry; of one between fragments, from their joined transform, or NaN where they are not joined.
 
-    If many are wrong, the initial solution with all of them is far from the truth, and graduated non-convexity does not
-    always converge: closures that contradict the odometry are therefore rejected first.
+    If many closures are wrong, the initial solution with all of them is far from the truth, and graduated non-convexity
+    does not always converge: closures that contradict the odometry are therefore rejected first.
 
     Args:
-        fragments: states of each.
-        joined: transforms of the fragments; closures between those that are not joined are rejected.
-        poses: (N, 4, 4) of all states, in the joined frames.
+        fragments: states of each fragment.
+        joined: transforms of the fragments; closures between fragments that are not joined are rejected.
+        poses: poses (N, 4, 4) of all states, in the joined frames.
         edges: L loop closures.
-        odometry: motions of the solution without loop closures.
+        odometry: motions between states in the solution without loop closures.
         probability: quantile of the chi-square distribution at which a closure is rejected.
     """
     of = fragment_of(fragments)
@@ -138,7 +138,7 @@ def consistent(
     params = gtsam.GncLMParams()
     params.setKnownInliers(known)
     params.setLossType(gtsam.GncLossType.TLS)
-    # Until all weights are 0 or 1: the first weights of all closures are below any tolerance if one of them is far off.
+    # Iterate until all weights are 0 or 1: if one closure is far off, the first weights of all are below any tolerance.
     params.setWeightsTol(0.0)
     optimizer = gtsam.GncLMOptimizer(graph, values, params)
     optimizer.setInlierCostThresholdsAtProbability(probability)
@@ -151,7 +151,7 @@ def consistent(
 def _ends_only(
     ends: Sequence[int], of: Int, joined: Joined, poses: Float, odometry: Sequence[Edge]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return a graph of the closures' end states, with each fragment's transform to its root as a weak prior."""
+    """Return a graph of the closures' end states; each fragment's first has a prior, which is weak unless in a root."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     seen: set[int] = set()
     for end in ends:
@@ -167,7 +167,7 @@ def _ends_only(
 
 
 def _odometry_between(odometry: KnownMotions, fragments: Sequence[range], ends: Sequence[int]) -> list[Edge]:
-    """Return the odometry between successive end states of each fragment; ``ends`` increase."""
+    """Return the odometry between successive end states of each fragment as edges; ``ends`` increase."""
     edges = []
     for states in fragments:
         inside = [end for end in ends if end in states]
@@ -177,7 +177,7 @@ def _odometry_between(odometry: KnownMotions, fragments: Sequence[range], ends: 
 
 
 def _most_voted(transforms: Sequence[Float]) -> tuple[int, Float]:
-    """Return how many transforms agree with the one that most agree with, itself included, and that one."""
+    """Return the number of votes, its own included, of the transform that most others agree with, and the transform."""
     votes = []
     for one in transforms:
         errors = np.array([se3_log(se3_inverse(one) @ other) for other in transforms])

@@ -1,9 +1,9 @@
 """Covariances of all variables of a linear system at once.
 
-The covariance of a variable, with those that it depends on, follows from the covariance of the latter alone, so that
-all are found from the last variable to the first (K. Takahashi, J. Fagan, M.-S. Chin, 1973). Variables are taken
-together in cliques. Asked for one by one, each variable of the few large cliques, in which loop closures tie many
-states together, would cost the elimination of its whole clique.
+The joint covariance of a variable and those that it depends on follows from the covariance of the latter alone, so that
+all are computed from the last variable to the first (K. Takahashi, J. Fagan, M.-S. Chin, 1973). Variables are grouped
+in cliques. Computed one by one, each variable of the few large cliques, in which loop closures tie many states
+together, would cost the elimination of its whole clique.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from scipy.linalg import lapack
 from graphvio.arrays import Float
 
 _MAX_ZEROS = 3  # variables in a clique that one of its variables does not depend on: cheaper than one more clique
-_MAX_MERGED = 6  # variables of a clique that has such
+_MAX_MERGED = 6  # variables of a clique in which some do not depend on all others
 
 
 @dataclass(eq=False)
 class _Clique:
-    """Variables of successive elimination, each tied to all after it and to the separator."""
+    """Variables that are eliminated in succession, each dependent on all after it and on the separator."""
 
-    rows: list[int]  # of the variables in the system, the last one first
-    separator: list[int]  # keys of the variables after them that they depend on
+    rows: list[int]  # rows of the variables in the system, the last one first
+    separator: list[int]  # keys of the later variables that they depend on
     parent: _Clique | None  # the clique that holds all of the separator, or None
     children: int  # number of cliques whose parent it is and that have no covariance yet
-    columns: dict[int, slice]  # of its variables and the separator in ``covariance``
-    covariance: Float  # of both; empty before it is computed, and after the last child's is
+    columns: dict[int, slice]  # key -> columns in ``covariance``, of its variables and the separator
+    covariance: Float  # joint covariance of both; empty before it is computed, and after the last child's is
 
 
 def covariances(net: gtsam.GaussianBayesNet) -> Iterator[tuple[int, Float]]:
-    """Yield key and covariance of each variable of a system after its elimination, one variable a row."""
+    """Yield key and covariance of each variable of an eliminated system that has one conditional per variable."""
     conditionals = dict(enumerate(net.at(row) for row in range(net.size())))
     del net  # each row is freed when it has been used
     keys = [list(each.keys()) for each in conditionals.values()]
@@ -65,7 +65,7 @@ def covariances(net: gtsam.GaussianBayesNet) -> Iterator[tuple[int, Float]]:
 
 
 def _cliques(keys: list[list[int]]) -> list[_Clique]:
-    """Return the cliques, each after its parent, of rows given by the keys of their variables, the eliminated first."""
+    """Group rows into cliques, each after its parent; a row is given by its keys, the eliminated variable's first."""
     row_of = {each[0]: row for row, each in enumerate(keys)}
     of: dict[int, _Clique] = {}
     found: list[_Clique] = []
@@ -87,7 +87,7 @@ def _cliques(keys: list[list[int]]) -> list[_Clique]:
 
 
 def _of_separator(clique: _Clique) -> Float:
-    """Return the covariance of a clique's separator from its parent, whose own is freed after the last child."""
+    """Return the covariance of a clique's separator, cut from that of its parent, which the last child frees."""
     parent = clique.parent
     if parent is None:
         return np.zeros((0, 0))
@@ -100,7 +100,10 @@ def _of_separator(clique: _Clique) -> Float:
 
 
 def _covariance(system: Float, width: int, of_separator: Float) -> Float:
-    """Return the joint covariance (N, N) of ``width`` variables with ``system`` (width, N) and of their separator."""
+    """Return the joint covariance (N, N) of variables and their separator, given their rows (``width``, N).
+
+    ``system`` has the variables in its first ``width`` columns, followed by the separator, whose covariance is known.
+    """
     inverse = lapack.dtrtri(np.asfortranarray(system[:, :width]))[0]
     step = inverse @ system[:, width:]
     joint = np.empty((system.shape[1], system.shape[1]))

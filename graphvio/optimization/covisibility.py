@@ -1,8 +1,8 @@
 """Verification of the matches between places by the optimised poses, for COLMAP's triangulation.
 
-Verified are matches of places that are neighbours in time and of the loop closures that are used, if they agree with
-the epipolar geometry of the optimised poses. All others stay in the database unverified, and COLMAP does not
-triangulate them.
+Matches between places that are neighbours in time, and between the places of used loop closures, are verified if they
+agree with the epipolar geometry of the optimised poses. All other matches stay in the database unverified, and COLMAP
+does not triangulate them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from graphvio.optimization.optimize import Optimization
 from graphvio.rig import Camera
 from graphvio.sources.read_ahead import read_ahead
 
-_NEIGHBOURS = 2  # places after each that it is matched with
+_NEIGHBOURS = 2  # number of following places that each place is matched with
 _EPIPOLAR_PX = 4.0  # COLMAP's limit for two views
-_MIN_MATCHES = 15  # of two images; COLMAP ignores fewer
+_MIN_MATCHES = 15  # between two images; COLMAP ignores pairs with fewer
 
 
 @dataclass(frozen=True, eq=False)
 class _ImagePair:
-    """The left images, or those of single cameras, of two places."""
+    """Two images to match: left images, or single cameras' images, of two places."""
 
     names: tuple[str, str]
     cameras: tuple[Camera, Camera]
@@ -70,7 +70,7 @@ def verify_matches(
 def _stored(
     pair: _ImagePair, database: FeatureDatabase
 ) -> tuple[_ImagePair, tuple[Float, Float], Int | None, list[AnyArray]]:
-    """Return what the database holds of two images: pixels, and matches, or else None and the descriptors to match."""
+    """Return an image pair with its features' pixels and stored matches; without these, None and the descriptors."""
     pixels = (database.pixels(pair.names[0]), database.pixels(pair.names[1]))
     if database.has_matches(*pair.names):
         return pair, pixels, database.all_matches(*pair.names), []
@@ -104,7 +104,7 @@ def _neighbours(
 def _loops(
     optimization: Optimization, sessions: Sequence[SessionInput], database: FeatureDatabase
 ) -> Iterator[_ImagePair]:
-    """Yield the images that the search matched, of the loop closures that are used."""
+    """Yield the image pairs that the loop search matched, of the loop closures that are used."""
     for loop in optimization.loops:
         if loop.refusal:
             continue

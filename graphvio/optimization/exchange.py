@@ -1,4 +1,4 @@
-"""The result in other formats: trajectory (TUM), covariances and frames (CSV), pose graph (g2o), points (PLY)."""
+"""Export of an optimisation: trajectory (TUM), covariances and frames (CSV), pose graph (g2o), points (PLY)."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from graphvio.results.writer import COVARIANCE_HEADER, covariance_row
 from graphvio.trajectory_files import tum_line
 
 _POINT = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]  # as viewers read it
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]  # as viewers expect
 )
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 def trajectory_text(session: OptimizedSession) -> str:
-    """Return all poses in the TUM format, each in its frame."""
+    """Return all poses of a session in the TUM format, each pose in the frame of its epoch."""
     poses = zip(session.record.stamps_ns.tolist(), session.nav_T_body, strict=True)
     return "".join(f"{tum_line(stamp, pose)}\n" for stamp, pose in poses)
 
 
 def frames_text(session: OptimizedSession) -> str:
-    """Return first stamp, last stamp and frame of each run of poses in one frame, as CSV."""
+    """Return, as CSV, the first stamp, last stamp and frame of each sequence of poses that share a frame."""
     stamps, frame = session.record.stamps_ns, session.frame
     begins = np.concatenate([[0], np.flatnonzero(np.diff(frame)) + 1]).tolist()
     ends = [*(begin - 1 for begin in begins[1:]), len(frame) - 1]
@@ -51,9 +51,9 @@ def covariance_text(session: OptimizedSession) -> str:
 def write_g2o(optimization: Optimization, path: Path) -> None:
     """Write the states' poses as a pose graph, for tools without IMU factors.
 
-    Its edges are the measured motions with their covariances, but with the relative poses of the solution without loop
-    closures, which the IMU contributes to; one from the previous state where no motion ends in a state; and the loop
-    closures.
+    Its edges are the measured motions, with their covariances but with the relative poses of the solution without loop
+    closures, to which the IMU contributes; an edge from the previous state to each state in which no motion ends; and
+    the loop closures.
 
     Raises:
         OptimizationError: if the file cannot be written.
@@ -76,7 +76,7 @@ def write_g2o(optimization: Optimization, path: Path) -> None:
 
 
 def _odometry_edges(optimization: Optimization) -> Iterator[Edge]:
-    """Yield an edge for each measured motion, and one from the previous state to each state in which none ends."""
+    """Yield an edge per measured motion, and one from the previous state to each state in which no motion ends."""
     marginals: Marginals | None = None
     poses, first = poses_of(optimization.alone, int(sum(len(each.nodes.rows) for each in optimization.sessions))), 0
     for session in optimization.sessions:
@@ -94,7 +94,7 @@ def _odometry_edges(optimization: Optimization) -> Iterator[Edge]:
 
 
 class Points(NamedTuple):
-    """Points of a frame of the optimisation."""
+    """Triangulated points in one frame of the optimisation."""
 
     positions: Float  # (N, 3) in nav, metres
     grey: AnyArray  # (N,) uint8, mean of the images that see the point

@@ -1,8 +1,8 @@
 """The rig's calibration as variables of the graph: extrinsics of each pair, and the IMU's time offset.
 
-A pair whose true ``body_T_left`` is ``C`` times the rig file's measures a motion ``M`` of body as ``C^-1 M C``, see
-`graphvio.frontend.pairs.extrinsic_monitor`. Its images are taken ``d`` later on the IMU's clock than by the rig file,
-so that it sees body at ``x exp(d xi)``, with the twist ``xi`` of body.
+If a pair's true ``body_T_left`` is ``C`` times that of the rig file, the pair measures a motion ``M`` of body as
+``C^-1 M C``, see `graphvio.frontend.pairs.extrinsic_monitor`. If its images were taken ``d`` seconds later on the IMU's
+clock than the rig file states, it sees body at the pose ``x exp(d xi)``, with the twist ``xi`` of body.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphvio.measurements.motion import RelativeMotion
 from graphvio.optimization.solver import Marginals
 from graphvio.rig import Rig
 
-_FIRST_SIGMAS = np.repeat([0.02, 0.005], 3)  # of the first pair against the IMU: radians, metres
+_FIRST_SIGMAS = np.repeat([0.02, 0.005], 3)  # prior of the first pair's pose relative to the IMU: radians, metres
 _OTHER_SIGMAS = np.repeat([0.05, 0.05], 3)
 _OFFSET_SIGMA_S = 0.02
 
@@ -42,14 +42,14 @@ class RigCorrection:
     """Corrections of a session's rig file."""
 
     pairs: dict[int, Float]  # pair -> correction (4, 4), by which its ``body_T_left`` is multiplied from the left
-    # pair -> covariance (6, 6) of the correction, tangent ``[rotation, translation]``; zero for the first pair without
-    # an IMU
+    # pair -> covariance (6, 6) of the correction, tangent ``[rotation, translation]``; about zero for the first pair if
+    # there is no IMU
     covariances: dict[int, Float]
     offset_s: float  # added to the IMU's time offset
     offset_sigma_s: float | None  # its standard deviation, or None without an IMU
 
     def corrected(self, rig: Rig) -> Rig:
-        """Return the rig with these corrections."""
+        """Return a rig with these corrections applied."""
         pairs = []
         for j, pair in enumerate(rig.pairs):
             correction = self.pairs.get(j, np.eye(4))
@@ -64,7 +64,7 @@ class RigCorrection:
 
 
 def unknowns(session: int, pairs: int, with_imu: bool) -> Iterator[tuple[int, Any, gtsam.NonlinearFactor]]:
-    """Yield key, initial value and prior of each variable; without an IMU the first pair's extrinsics are fixed."""
+    """Yield key, initial value and prior of each variable; without an IMU, a tight prior fixes the first pair."""
     for pair in range(pairs):
         sigmas = _FIRST_SIGMAS if pair == 0 else _OTHER_SIGMAS
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas if with_imu or pair else np.full(6, 1e-9))
@@ -77,7 +77,7 @@ def unknowns(session: int, pairs: int, with_imu: bool) -> Iterator[tuple[int, An
 def own_motion(
     session: int, pair: int, i: int, j: int, motion: RelativeMotion, twists: tuple[Float, Float] | None
 ) -> gtsam.NoiseModelFactor:
-    """Return the factor of a pair's motion of body, by the rig file's extrinsics, from state ``i`` to ``j``.
+    """Return the factor of a motion of body from state ``i`` to ``j``, measured by one pair with the rig file.
 
     ``twists`` are body's angular and linear velocities (6,) at both states; None without an IMU.
     """
@@ -86,7 +86,7 @@ def own_motion(
 
 
 def correction_of(marginals: Marginals, values: gtsam.Values, session: int, pairs: int) -> RigCorrection:
-    """Return the corrections of a session by the solution."""
+    """Return the corrections of a session's rig file from the solution."""
     has_offset = values.exists(d(session))
     return RigCorrection(
         {pair: values.atPose3(c(session, pair)).matrix() for pair in range(pairs)},

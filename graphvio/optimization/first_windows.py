@@ -1,8 +1,8 @@
-"""What is known of an epoch's first states from before its first pose, as a factor of a session's graph.
+"""Measurements from before an epoch's first pose, as a factor on the epoch's first states in a session's graph.
 
-Single cameras have no pose until the scale is known. What images and IMU showed until then is a quadratic cost of the
-first poses, and of velocity, gravity and biases. The frame in which it was found says nothing: it becomes a cost of the
-poses relative to the first of them, and of velocity and gravity as seen in body there.
+Single cameras have no pose until the scale is known. The images and IMU samples until then give a quadratic cost of the
+first poses, and of velocity, gravity and biases. The frame of these poses is arbitrary, so the cost is rewritten as one
+of the poses relative to the first of them, and of velocity and gravity in the body frame at the first.
 """
 
 from __future__ import annotations
@@ -20,22 +20,26 @@ from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.measurements.window_views import FirstWindow
 from graphvio.optimization.views import RelativePoses, root_of
 
-_OTHERS = 12  # velocity, gravity, biases
+_OTHERS = 12  # dimension of velocity, gravity and biases
 _GRAVITY_NAV = np.array([0.0, 0.0, -GRAVITY_M_S2])
 
 
 class FirstWindows(NamedTuple):
-    """V costs; the states of cost i are rows ``begins[i]`` to ``begins[i + 1]`` of ``row`` and ``poses``."""
+    """V costs as columns; the states of cost i are rows ``begins[i]`` to ``begins[i + 1]`` of ``row`` and ``poses``."""
 
     begins: Int  # (V + 1,)
     row: Int  # (S,) rows of the framesets
     poses: Float  # (S, 4, 4) ``nav_T_body`` at which the cost was linearised
-    others: Float  # (V, 12) velocity (m/s) and gravity (m/s^2) in body at the first, biases of gyro and accelerometer
-    gradient: Float  # one after the other, 6 K + 6 numbers of a cost of K states
-    information: Float  # one after the other, (6 K + 6)^2 numbers
+    # (V, 12) velocity (m/s) and gravity (m/s^2) in body at the first state, biases of gyro and accelerometer
+    others: Float
+    gradient: Float  # concatenated, 6 K + 6 numbers for a cost of K states
+    information: Float  # concatenated, (6 K + 6)^2 numbers for a cost of K states
 
     def at(self, number: int) -> tuple[Int, Float, Float, Float, Float]:
-        """Return rows (K,), poses, the other values (12,), information and gradient of relative poses and others."""
+        """Return a cost's rows (K,), poses (K, 4, 4), ``others`` (12,), information and gradient.
+
+        Information and gradient are those of the relative poses and of ``others``, 6 K + 6 dimensions.
+        """
         states = slice(int(self.begins[number]), int(self.begins[number + 1]))
         sizes = 6 * np.diff(self.begins) + 6
         size, begin, begin2 = int(sizes[number]), int(sizes[:number].sum()), int((sizes[:number] ** 2).sum())
@@ -49,7 +53,7 @@ class FirstWindows(NamedTuple):
 
     @staticmethod
     def of(given: Iterable[FirstWindow], row_of: Mapping[int, int]) -> FirstWindows:
-        """Collect costs, of those whose states all have a row."""
+        """Collect the costs whose states all have a row; ``row_of`` gives the row of a stamp."""
         kept = [each for each in given if all(int(ns) in row_of for ns in each.stamps_ns)]
         relative = [_relative(each) for each in kept]
         return FirstWindows(
@@ -63,7 +67,7 @@ class FirstWindows(NamedTuple):
 
 
 def _relative(start: FirstWindow) -> tuple[Float, Float, Float]:
-    """Return the other values (12,), information and gradient of relative poses and these, for any first pose."""
+    """Return ``others`` (12,), and information and gradient of relative poses and ``others``, first pose eliminated."""
     n = len(start.poses)
     first_R_nav = start.poses[0, :3, :3].T
     velocity, gravity = first_R_nav @ start.velocity, first_R_nav @ start.gravity
@@ -88,11 +92,11 @@ def first_window_factor(
     """Return the factor between the poses of K states, and velocity and biases of the first.
 
     Args:
-        states: (K,) of the graph.
-        poses: (K, 4, 4) at which the cost was linearised.
-        others: (12,) velocity and gravity in body at the first, and biases.
-        information: (6 K + 6, 6 K + 6).
-        gradient: (6 K + 6,).
+        states: numbers (K,) of the states in the graph.
+        poses: poses (K, 4, 4) at which the cost was linearised.
+        others: velocity and gravity in body at the first state, and biases (12,).
+        information: information (6 K + 6, 6 K + 6) of relative poses and ``others``.
+        gradient: gradient (6 K + 6,) of the cost, likewise.
     """
     root, offset = root_of(information, gradient)
     keys = [*(x(int(k)) for k in states), v(int(states[0])), b(int(states[0]))]
@@ -102,7 +106,7 @@ def first_window_factor(
 def _error(
     root: Float, offset: Float, poses: Float, others: Float
 ) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[Float] | None], Float]:
-    """Return the error ``root d + offset`` with its derivatives; d are changes of relative poses and other values."""
+    """Return the error ``root d + offset`` with its derivatives; d is the change of relative poses and ``others``."""
     relative = RelativePoses(root, poses)
     of_velocity, of_gravity, of_gyro, of_accel = np.split(root[:, 6 * (len(poses) - 1) :], 4, axis=1)
 

@@ -36,26 +36,26 @@ class Fragment:
     """An epoch of a session, whose poses share a frame."""
 
     session: int  # number of the session
-    epoch: int  # of the session
-    states: range  # numbered through all sessions
+    epoch: int  # number of the epoch in its session
+    states: range  # numbers of its states, consecutive across all sessions
     start: RigState  # the rig at the first state
     with_imu: bool  # whether the first state has a velocity and biases
 
 
 class SessionGraph:
-    """Factors and initial values of all sessions; states are numbered through, session after session.
+    """Factors and initial values of all sessions; states are numbered consecutively, session after session.
 
     Args:
-        sessions: states of each.
-        imus: of each session, or None.
-        config: of the odometry's back-end.
-        calibrates: whether extrinsics and the IMU's time offset are variables; the factors are then the motions of
-            single pairs over whole keyframes, where there are any.
+        sessions: the states of each session.
+        imus: the IMU of each session's rig, or None.
+        config: the configuration of the odometry's back-end.
+        calibrates: whether extrinsics and the IMU's time offset are variables; the factors are then the motions that
+            single pairs measured over whole keyframes, where there are any.
 
     Attributes:
-        values: of all states by the odometry.
-        fragments: of all sessions, in order.
-        firsts: (S + 1,) first state of each session, and the number of states.
+        values: initial values of all states, from the odometry.
+        fragments: epochs of all sessions, in order.
+        firsts: (S + 1,) number of the first state of each session, and the number of states.
     """
 
     def __init__(
@@ -89,7 +89,10 @@ class SessionGraph:
     def complete(
         self, roots: Iterable[int], edges: Iterable[Edge] = ()
     ) -> tuple[gtsam.NonlinearFactorGraph, dict[str, list[int]]]:
-        """Return the graph with loop closures, and its factors by kind; the first poses of ``roots`` define frames."""
+        """Return the graph with loop closures as ``edges``, and the indices of its factors by kind.
+
+        The first pose of each fragment in ``roots`` gets a prior, and so defines a frame.
+        """
         graph, kinds = gtsam.NonlinearFactorGraph(self._graph), dict(self._kinds)
         chosen = frozenset(roots)
         priors = [
@@ -152,7 +155,7 @@ class SessionGraph:
                         k - 1, k, dt, config.motion_accel_sigma_m_s2, imu, config.imu_noise_scale
                     ):
                         self.add(factor)
-                if not has_motion[n]:  # constant velocity by the odometry, eq. (11)
+                if not has_motion[n]:  # constant velocity, with the odometry's motion, eq. (11)
                     motion = np.linalg.inv(record.smoothed[before]) @ record.smoothed[row]
                     accels = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
                     self.add(constant_velocity(k - 1, k, motion, dt, dt, np.zeros(2), accels))
@@ -161,7 +164,7 @@ class SessionGraph:
                 self.add(zero_velocity(k))
 
     def _add_own_motions(self, session: int, first: int, nodes: Nodes) -> Int:
-        """Add the motions of single pairs and the calibration; return the rows (K,) in which the motions end."""
+        """Add the motions that single pairs measured, and the calibration; return the rows (K,) where these end."""
         record = nodes.record
         own, with_imu = record.own, bool(record.with_imu.all())
         if not len(record.own_pair):
@@ -194,7 +197,7 @@ class SessionGraph:
             )
 
     def _add_views(self, first: int, nodes: Nodes) -> None:
-        """Add the views of landmarks by a rig of single cameras only, and what it knew before the first pose."""
+        """Add the costs of a rig of single cameras only: views of landmarks, and those from before the first pose."""
         views = nodes.record.views
         self._kind = "views"
         for number in range(len(views.begins) - 1):
@@ -207,7 +210,7 @@ class SessionGraph:
 
 
 def _initial_priors(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield priors of a fragment's first state; its pose defines a frame if it is a root."""
+    """Yield priors of a fragment's first state; the pose has one only in a root, where it defines the frame."""
     k, pose = fragment.states.start, fragment.start.nav_T_body
     if not fragment.with_imu:
         if is_root:

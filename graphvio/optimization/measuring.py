@@ -1,4 +1,4 @@
-"""A session's odometry with its results in files, whose measurements are recorded for the graph."""
+"""Run of a session's odometry that writes results to files and records the measurements for the graph."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ def measure(
     on_progress: Callable[[int, int], None],
     ahead: FeaturesAhead | None = None,
 ) -> bool:
-    """Run an odometry on a session.
+    """Run an odometry on a session, write its results and record its measurements.
 
     Args:
-        source: of the session.
-        odometry: that has processed nothing yet.
-        recorder: gets what it measures.
-        folder: of the odometry's results; those of an interrupted run are removed.
-        on_progress: called with the number of estimated framesets and of all.
-        ahead: extracts features of places at the same time, as far as they are known until then. It stops where the
-            calibration is corrected: features are matched in stereo by one calibration.
+        source: the session's recording.
+        odometry: an odometry that has processed nothing yet.
+        recorder: records what the odometry measures.
+        folder: the folder of the odometry's results; those of an interrupted run are removed.
+        on_progress: called with the number of estimated framesets and of all framesets.
+        ahead: extracts the features of those places that are known while the odometry runs. It stops where the
+            calibration is corrected, as all features have to be matched in stereo with the same calibration.
 
     Returns:
-        Whether nothing was corrected on the way, and nothing speaks against the rig. After the end of an epoch it is
-        not known: single cameras may have corrected a calibration that they have not reported yet.
+        Whether the calibration was not corrected and the odometry has no warning on the rig. Also False if there were
+        several epochs, as single cameras may then have corrected a calibration without having reported it yet.
     """
     is_as_given = True
 

@@ -17,8 +17,8 @@ from graphvio.optimization.record import SessionRecord
 class Nodes:
     """The N states of a session's graph."""
 
-    record: SessionRecord  # of the session
-    rows: Int  # (N,) rows of their framesets, increasing
+    record: SessionRecord  # the session's record
+    rows: Int  # (N,) rows of the states' framesets in the record, increasing
     motions: Int  # (M,) indices of the record's motions that begin and end at states
 
     @property
@@ -32,7 +32,7 @@ class Nodes:
         return np.asarray(self.record.epoch[self.rows])
 
     def index_of_row(self, row: int) -> int:
-        """Return the state of a frameset.
+        """Return the index of the state that belongs to a frameset's row.
 
         Raises:
             OptimizationError: if the frameset is no state.
@@ -43,7 +43,7 @@ class Nodes:
         return index
 
     def twist(self, n: int) -> Float:
-        """Return angular rate (rad/s) and velocity (m/s) of body in body (6,) at state ``n``, which the IMU covers."""
+        """Return angular rate (rad/s) and velocity (m/s) of body, in body (6,), at state ``n``; needs the IMU there."""
         record, row = self.record, int(self.rows[n])
         inertial = record.inertial
         around = inertial.values[max(int(inertial.begins[row + 1]) - 1, 0) : int(inertial.begins[row + 1]) + 1]
@@ -61,9 +61,10 @@ class Nodes:
 
 
 def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
-    """Choose the framesets that motions refer to, the first and last of each epoch, and others in between.
+    """Choose the framesets that become states: those that motions refer to, first and last of each epoch, and others.
 
-    These are as far apart as the interval, if there are framesets: more motions from one keyframe add little.
+    The others lie in between, so that states are about ``interval_s`` apart where there are framesets: more motions
+    from one keyframe add little.
     """
     stamps, motions = record.stamps_ns, record.motions
     wanted = record.is_keyframe.copy()
@@ -82,7 +83,7 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     seen[motions.row[~motions.is_partial]] = True
     if len(record.views.row):
         wanted[record.views.row] = wanted[record.first_windows.row] = True
-        seen |= record.is_stationary  # of single cameras nothing else is known of a standstill
+        seen |= record.is_stationary  # single cameras have no other measurement at a standstill
     for row in range(len(stamps)):
         due = row + 1 < len(stamps) and stamps[row + 1] - latest > interval_s * 1e9 and seen[row]
         if wanted[row] or due:
@@ -95,11 +96,11 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
 def spread(nodes: Nodes, nav_T_body: Float) -> Float:
     """Interpolate the poses (F, 4, 4) of all framesets from those (N, 4, 4) of the states.
 
-    The smoothed trajectory, of single cameras alone the online one, is kept between two states; its error at the second
-    is distributed linearly in time.
+    Between two states, the shape of the smoothed trajectory is kept (that of the online one for a rig of single cameras
+    only); its error at the second state is distributed linearly in time.
     """
     record, rows = nodes.record, nodes.rows
-    # Single cameras' smoothed poses are those of keyframes; between them the online ones are not of one estimate.
+    # Of single cameras, only keyframes have smoothed poses: with online ones in between, two estimates would be mixed.
     chain = record.online if len(record.views.row) else record.smoothed
     poses = np.empty_like(chain)
     stamps = record.stamps_ns

@@ -1,4 +1,4 @@
-"""Optimisation of sessions as one graph: solved, joined by loop closures, and solved again."""
+"""Optimisation of sessions as one graph: solved without loop closures, joined by them, and solved again."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class OptimizedSession:
     """The solution of one session."""
 
     nodes: Nodes  # states of the graph
-    nav_T_body: Float  # (F, 4, 4) of all framesets, in the frame that ``frame`` gives
+    nav_T_body: Float  # (F, 4, 4) poses of all framesets, in the frame that ``frame`` gives
     # (N, 6, 6) of the states' poses relative to the origin of their frame, tangent ``[rotation, translation]`` in body
     covariance: Float
-    frame: Int  # (F,) number of each frameset's frame; 0 is that of the first session's first
+    frame: Int  # (F,) number of each frameset's frame; 0 is the frame of the first session's first epoch
 
     @property
     def record(self) -> SessionRecord:
@@ -49,8 +49,8 @@ class JudgedLoop:
 
     closure: LoopClosure  # as it was found
     refusal: str  # why it is not used, or empty
-    # squared Mahalanobis distance from the solution, 6 degrees of freedom; of a refused one, with the solution's
-    # covariance. NaN between parts that are not joined.
+    # squared Mahalanobis distance from the solution, 6 degrees of freedom; of a refused closure, with the covariance of
+    # the solution, or of the odometry if that contradicts it. NaN between parts that are not joined
     distance: float
 
 
@@ -62,24 +62,24 @@ class Optimization:
     loops: Sequence[JudgedLoop]  # all given loop closures
     fragments: Sequence[Fragment]  # epochs of all sessions
     frames: Sequence[int]  # number of each fragment's frame
-    before: dict[str, Residuals]  # kind of factor -> residuals of the odometry's states
-    after: dict[str, Residuals]  # kind of factor -> residuals of the solution
-    graph: gtsam.NonlinearFactorGraph  # with the loop closures that are used
+    before: dict[str, Residuals]  # kind of factor -> residuals at the odometry's states
+    after: dict[str, Residuals]  # kind of factor -> residuals at the solution
+    graph: gtsam.NonlinearFactorGraph  # the graph with the loop closures that are used
     values: gtsam.Values  # the solution
     edges: Sequence[Edge]  # the loop closures that are used, as edges
     graph_alone: gtsam.NonlinearFactorGraph  # without loop closures, each fragment in its own frame
     alone: gtsam.Values  # solution of ``graph_alone``
-    # of each session's rig file, or None where the calibration is not estimated
+    # corrections of each session's rig file, or None where the calibration is not estimated
     corrections: Sequence[RigCorrection | None]
 
     @property
     def cost_before(self) -> float:
-        """Half the sum of all squared residuals of the odometry's states, without loop closures."""
+        """Half the sum of all squared residuals at the odometry's states, without loop closures."""
         return _cost(self.before)
 
     @property
     def cost_after(self) -> float:
-        """Half the sum of all squared residuals of the solution, without loop closures."""
+        """Half the sum of all squared residuals at the solution, without loop closures."""
         return _cost(self.after)
 
 
@@ -95,10 +95,10 @@ def optimize(
     """Optimise the trajectories of sessions over all their measurements.
 
     Args:
-        records: what the odometry measured in S sessions.
-        imus: of each session's rig, or None.
+        records: what the odometry measured in each of S sessions.
+        imus: the IMU of each session's rig, or None.
         closures: true and false loop closures.
-        config: of the back-end and of this stage.
+        config: the configuration of the back-end and of this stage.
         on_progress: called after each iteration.
         calibrates: whether the extrinsics of the pairs and the IMU's time offset are estimated, with priors.
 
@@ -197,7 +197,7 @@ def _session(
 def _judged(
     closure: LoopClosure, edge: Edge, is_used: bool, distance: float, solution: Float, limit: float
 ) -> JudgedLoop:
-    """Return a closure with its outcome; ``distance`` is that of a refused one, NaN if its fragments are not joined."""
+    """Return a closure with its outcome; ``distance`` counts if it is refused: NaN if its fragments are not joined."""
     if is_used:
         error = se3_log(se3_inverse(se3_inverse(solution[edge.first]) @ solution[edge.second]) @ edge.first_T_second)
         return JudgedLoop(closure, "", float(error @ np.linalg.solve(edge.covariance, error)))

@@ -38,10 +38,10 @@ from graphvio.version import __version__
 
 DATABASE = "database.db"
 _REFINED = "rig-refined.yaml"
-_AHEAD = "features-ahead.db"  # of a session, while its odometry runs
+_AHEAD = "features-ahead.db"  # features of a session that are extracted while its odometry runs
 
 Progress = Callable[[str, float, float], None]
-"""Called with the stage, how much of it is done, and how much there is."""
+"""Called with the name of the stage, the amount of work done in it, and the total amount."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +65,11 @@ def optimize_sessions(
 
     Args:
         sources: one or several recordings.
-        out: folder of the results: new, or that of an interrupted optimisation of the same, which is continued.
-        config: of all stages.
+        out: folder of the results: new, or that of an interrupted optimisation of the same inputs, which is continued.
+        config: configuration of all stages.
         with_loops: whether to find loop closures and write a map, which needs the extra ``maps``.
         calibrates: whether the extrinsics of the pairs and the IMU's time offset are variables of the graph. Each rig
-            is calibrated from its whole recording before, here and where the configuration has
+            is then first calibrated from its whole recording, as it also is where the configuration has
             ``calibration: {online: true}``.
         on_progress: called with the progress of each stage.
 
@@ -106,7 +106,7 @@ def _sessions(sources: Sequence[Source]) -> list[Session]:
 
 
 class Stages:
-    """The stages of `optimize_sessions`, which see, to be run one by one, possibly on different machines.
+    """The stages of `optimize_sessions` (see there) as single steps, which may run on different machines.
 
     Attributes:
         inputs: name -> value of everything that determines the results.
@@ -128,7 +128,7 @@ class Stages:
     ) -> None:
         if with_loops:
             for camera in (camera for each in sessions for camera in each.source.rig.cameras):
-                colmap_model(camera)  # which raises: now, and not after the odometry
+                colmap_model(camera)  # raises if there is none: now, and not after the odometry
         self._sessions = sessions
         self._calibrates = calibrates
         self.calibrates_first = calibrates or config.estimates_calibration
@@ -149,15 +149,15 @@ class Stages:
         return self._space.locked()
 
     def calibrate(self, number: int, *, with_features: bool = False) -> None:
-        """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays.
+        """Calibrate a session's rig from its whole recording for the later stages; if that fails, keep the rig file.
 
-        Where the recording says nothing against the rig file, this is the session's odometry as well, and `record`
-        has nothing left to do.
+        Where the recording does not contradict the rig file, the odometry of this stage counts as the session's own,
+        and `record` has nothing left to do.
         """
         session = self._sessions[number]
         stage, names = f"calibration of {session.name}", [f"{session.name}/{name}" for name in (_REFINED, FINDINGS)]
         if not self._space.has_finished(stage):
-            self._space.forget(_odometry_of(session))  # whose files are written over
+            self._space.forget(_odometry_of(session))  # its files are overwritten
             rig, sentences, is_recorded = self._calibrated(number, stage, with_features)
             self._space.write(names[0], to_text(rig, self._space.folder / session.name).encode())
             self._space.write(names[1], (json.dumps(sentences, indent=2) + "\n").encode())
@@ -165,7 +165,7 @@ class Stages:
         self.use_calibrated(number)
 
     def _calibrated(self, number: int, stage: str, with_features: bool) -> tuple[Rig, list[str], bool]:
-        """Return the calibrated rig, sentences on it, and whether all was measured with it, and is recorded."""
+        """Return the calibrated rig, sentences on it, and whether all motions were measured with it, and recorded."""
         session, rig = self._sessions[number], self._sessions[number].source.rig
         try:
             odometry = Odometry(rig, calibrating(self._config))
@@ -182,17 +182,17 @@ class Stages:
         if is_as_given and found is rig:
             self._keep(number, recorder)
             return rig, sentences, True
-        self._features_ahead_of(session).unlink(missing_ok=True)  # by another rig
+        self._features_ahead_of(session).unlink(missing_ok=True)  # extracted with another calibration
         return found, sentences, False
 
     def use_calibrated(self, number: int) -> None:
-        """Use the rig that `calibrate` has written, in this folder or in another one that it was copied from."""
+        """Use the rig file that `calibrate` wrote, in this folder or in another one from which it was copied here."""
         self._rigs[number] = load_rig(self._space.folder / self._sessions[number].name / _REFINED)
 
     def record(self, number: int, *, with_features: bool = False) -> SessionRecord:
         """Run the odometry on a session, write its results, and return what it measured.
 
-        With ``with_features``, features of places are extracted at the same time, as far as they are known until then.
+        With ``with_features``, features are extracted at the same time, of the places that are known by then.
         """
         session = self._sessions[number]
         stage = _odometry_of(session)
@@ -216,7 +216,7 @@ class Stages:
         return measure(session.source, odometry, recorder, folder, on_progress, ahead)
 
     def _keep(self, number: int, recorder: Recorder) -> None:
-        """Write what was recorded of a session, and finish its odometry."""
+        """Write the record of a session, and mark its odometry as finished."""
         session = self._sessions[number]
         files = self._recorded_files(session)
         self._space.write(files[0], recorder.record().to_bytes())
@@ -328,13 +328,13 @@ class Stages:
         return FeaturesAhead(session.source, self._rigs[number], session.name, database, self._config)
 
     def _features_ahead_of(self, session: Session) -> Path:
-        """Return the path of the database of what is extracted while the session's odometry runs."""
+        """Return the path of the database of features that are extracted while the session's odometry runs."""
         return self._space.folder / session.name / _AHEAD
 
     def _take_features_ahead(
         self, session: Session, rig: Rig, stamps_ns: Sequence[int], whole: FeatureDatabase
     ) -> None:
-        """Copy what was extracted of a session's first places, however many: rows are in the order of time then."""
+        """Copy the features extracted ahead if they are of the session's first places, so that rows stay in order."""
         path = self._features_ahead_of(session)
         if not path.exists():
             return
@@ -345,12 +345,12 @@ class Stages:
 
 
 def _odometry_of(session: Session) -> str:
-    """Return the name of a stage."""
+    """Return the name of a session's odometry stage."""
     return f"odometry of {session.name}"
 
 
 def _features_of(name: str) -> str:
-    """Return the name of a stage."""
+    """Return the name of a session's feature stage."""
     return f"features of {name}"
 
 

@@ -20,15 +20,15 @@ from graphvio.odometry.step import NewKeyframe, Step
 from graphvio.optimization.first_windows import FirstWindows
 from graphvio.optimization.views import Views
 
-_NO_STAMP = -(2**62) - 1  # no measurement has it
+_NO_STAMP = -(2**62) - 1  # stamp that no measurement has
 
 
 class Inertial(NamedTuple):
-    """The IMU in N steps of constant angular velocity and specific force."""
+    """The IMU measurements as N steps of constant angular velocity and specific force."""
 
     begins: Int  # (F + 1,) the steps from frameset i - 1 to i are rows ``begins[i]`` to ``begins[i + 1]``
-    covers: Bool  # (F,) whether they cover all of that time and can be trusted
-    steps_s: Float  # (N,) durations
+    covers: Bool  # (F,) whether the steps to a frameset cover all of that time and can be trusted
+    steps_s: Float  # (N,) durations of the steps
     values: Float  # (N, 6) angular velocity, rad/s, and specific force, m/s^2, in body
 
 
@@ -37,11 +37,11 @@ class Motions(NamedTuple):
 
     reference: Int  # (M,) row of the frameset that each is measured from
     row: Int  # (M,) row of the frameset in which it ends
-    reference_T_current: Float  # (M, 4, 4) of body
+    reference_T_current: Float  # (M, 4, 4) motion of body
     covariance: Float  # (M, 6, 6) tangent ``[rotation, translation]`` in body at its end
-    shared_covariance: Float  # (M, 6, 6) its part that all motions from one reference share, same tangent
-    inliers: Int  # (M,) number of points
-    is_partial: Bool  # (M,) whether these were too few for a motion: see `VisualResult.partial_motion`
+    shared_covariance: Float  # (M, 6, 6) part of it that all motions from one reference share, same tangent
+    inliers: Int  # (M,) number of inlier points
+    is_partial: Bool  # (M,) whether there were too few points for a full motion: see `VisualResult.partial_motion`
 
     def at(self, k: int, stamps_ns: Int) -> RelativeMotion:
         """Return motion k."""
@@ -59,9 +59,9 @@ class Motions(NamedTuple):
 class SessionRecord:
     """Estimates and measurements of a session's odometry, for F framesets with a pose."""
 
-    name: str  # of the session
+    name: str  # name of the session
     stamps_ns: Int  # (F,) increasing
-    epoch: Int  # (F,) poses of different epochs do not share a nav frame
+    epoch: Int  # (F,) number of the epoch; poses of different epochs do not share a nav frame
     online: Float  # (F, 4, 4) ``nav_T_body`` as emitted
     smoothed: Float  # (F, 4, 4) ``nav_T_body`` as it left the smoother's window
     covariance: Float  # (F, 6, 6) of ``online``, tangent ``[rotation, translation]`` in body
@@ -72,16 +72,16 @@ class SessionRecord:
     is_keyframe: Bool  # (F,) whether later motions are measured from it
     with_imu: Bool  # (F,) whether the state has a velocity and biases
     is_start: Bool  # (F,) whether the state was initialised or reinitialised here
-    # (F,) row of the keyframe before this one, or -1 where this is none, or the motion is not known
+    # (F,) row of the previous keyframe, or -1 where this is no keyframe or the motion in between is not known
     keyframe_before: Int
-    # (F, 6, 6) of the motion since that one, tangent ``[rotation, translation]`` in body; zero where there is none
+    # (F, 6, 6) covariance of that motion, tangent ``[rotation, translation]`` in body; zero where there is none
     keyframe_covariance: Float
-    motions: Motions  # of the rig
-    own: Motions  # motions of body over whole keyframes, measured by single pairs
-    own_pair: Int  # the pair of each of these
+    motions: Motions  # motions measured by the whole rig
+    own: Motions  # motions of body over whole keyframes, each measured by a single pair
+    own_pair: Int  # the pair that measured each of these
     inertial: Inertial  # IMU samples
-    views: Views  # of landmarks, by a rig of single cameras only
-    first_windows: FirstWindows  # what such a rig knew before the first pose of each epoch
+    views: Views  # views of landmarks, of a rig of single cameras only
+    first_windows: FirstWindows  # costs from before the first pose of each epoch, of such a rig
 
     def to_bytes(self) -> bytes:
         """Return the record as a numpy archive; equal records give equal bytes."""
@@ -120,7 +120,7 @@ _GROUPS: dict[str, Any] = {
 
 
 class Recorder:
-    """Collects the steps of an odometry, whose `Odometry.subscribe` gets its `add`."""
+    """Collects the steps of an odometry into a `SessionRecord`; its `add` is passed to `Odometry.subscribe`."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -128,7 +128,7 @@ class Recorder:
         self._motions: list[RelativeMotion] = []
         self._own: list[tuple[int, RelativeMotion]] = []
         self._partial: set[int] = set()  # stamps of partial motions
-        self._refused: list[RelativeMotion] = []  # since the last motion that was used
+        self._refused: list[RelativeMotion] = []  # refused ones since the last motion that was used
         self._references: set[int] = set()
         self._since: list[tuple[Float, Float]] = []  # IMU since the last step with a pose
         self._is_covered = True
@@ -146,7 +146,7 @@ class Recorder:
         if estimate.nav_T_body is None or estimate.covariance is None or estimate.status is Status.LOST:
             return
         if step.initialised and motion is not None and step.used and self._steps:
-            # Vision overrules the prediction: use its refused motions as well, and not the IMU since then.
+            # Vision overrules the prediction: its refused motions are used as well, and the IMU since then is not.
             self._motions += [each for each in self._refused if each is not motion]
             if estimate.epoch == self._steps[-1].estimate.epoch:
                 for row in self._steps[self._used_at + 1 :]:
@@ -179,11 +179,11 @@ class Recorder:
         self._smoothed.update(poses)
 
     def add_views(self, views: WindowViews | FirstWindow) -> None:
-        """Add views of landmarks, as `graphvio.Odometry.on_views` hands them over."""
+        """Add views of landmarks or an epoch's first window, as `graphvio.Odometry.on_views` passes them on."""
         self._views.append(views)
 
     def record(self) -> SessionRecord:
-        """Return all that was added as a record.
+        """Return everything that was added as a record.
 
         Raises:
             OptimizationError: if no frameset has a pose.
@@ -242,7 +242,7 @@ class _Row:
 
 
 def _since_keyframe(keyframe: NewKeyframe | None) -> tuple[int, Float]:
-    """Return the stamp of the keyframe before one and the covariance (6, 6) of the motion since, or `_NO_STAMP`."""
+    """Return the stamp of the previous keyframe, or `_NO_STAMP`, and the covariance (6, 6) of the motion since."""
     if keyframe is None or keyframe.covariance is None or keyframe.previous_ns is None:
         return _NO_STAMP, np.zeros((6, 6))
     return keyframe.previous_ns, keyframe.covariance

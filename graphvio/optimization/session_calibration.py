@@ -11,19 +11,19 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.findings import described
 
 FINDINGS = "calibration.json"
-"""File of a session with what was found, a sentence each."""
+"""File in a session's folder with the findings of its calibration, a sentence each."""
 
 
 def calibrated_rig(rig: Rig, windows: CalibrationWindows, end_ns: int, on_progress: Progress) -> tuple[Rig, list[str]]:
     """Calibrate a rig from a recording, and return it with sentences on what was found.
 
-    It stays where the recording says nothing against it, or does not show it.
+    The given rig is returned where the recording does not contradict it, or does not suffice to estimate it.
 
     Args:
-        rig: of the rig file.
-        windows: of an odometry that has finished.
+        rig: the rig of the rig file.
+        windows: the windows of an odometry that has finished.
         end_ns: stamp of the recording's last frameset.
-        on_progress: follows the work.
+        on_progress: called with the progress of the calibration.
     """
     try:
         found = windows.calibrate("all", end_ns, on_progress, compares_halves=False)
@@ -35,12 +35,12 @@ def calibrated_rig(rig: Rig, windows: CalibrationWindows, end_ns: int, on_progre
 
 
 def cannot_be_calibrated(error: CalibrationError) -> str:
-    """Return a sentence on a rig that stays as it is."""
+    """Return a sentence on a rig that cannot be calibrated and is used as it is."""
     return f"calibration: as in the rig file, since it cannot be estimated: {error}"
 
 
 def session_findings(folder: Path) -> list[str]:
-    """Read what the calibration of a session found from its folder; nothing where it was not calibrated."""
+    """Read the findings of a session's calibration from its folder; empty where it was not calibrated."""
     try:
         return [str(sentence) for sentence in json.loads((folder / FINDINGS).read_text(encoding="utf-8"))]
     except (OSError, ValueError, TypeError):

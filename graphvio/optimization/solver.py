@@ -1,4 +1,4 @@
-"""Solves factor graphs: relative poses as edges, optimisation, residuals and covariances of the solution."""
+"""Solution of factor graphs: relative poses as edges, optimisation, residuals and covariances of the solution."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class KnownMotions(Protocol):
 class Edge:
     """A relative pose between two states, from a loop closure or a chain of other measurements."""
 
-    first: int  # state that it is measured from
+    first: int  # state that the pose is measured from
     second: int  # state in which it ends
-    first_T_second: Float  # (4, 4) of body
+    first_T_second: Float  # (4, 4) motion of body
     covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the second
 
     def factor(self) -> gtsam.NonlinearFactor:
@@ -56,7 +56,7 @@ class Edge:
         )
 
     def distance(self, known: KnownMotions) -> float:
-        """Return the squared Mahalanobis distance, 6 degrees of freedom, from motions that are independent of it."""
+        """Return its squared Mahalanobis distance, 6 degrees of freedom, from known motions independent of it."""
         first_T_second, covariance = known.motion(self.first, self.second)
         error = se3_log(se3_inverse(first_T_second) @ self.first_T_second)
         return float(error @ np.linalg.solve(covariance + self.covariance, error))
@@ -67,7 +67,7 @@ class Residuals:
     """Residuals of the factors of one kind."""
 
     distances: Float  # (N,) squared Mahalanobis distances
-    dimensions: int  # of all their errors
+    dimensions: int  # total dimension of the factors' errors
 
     @property
     def per_dimension(self) -> float:
@@ -78,7 +78,7 @@ class Residuals:
 def residuals(
     graph: gtsam.NonlinearFactorGraph, kinds: Mapping[str, Sequence[int]], values: gtsam.Values
 ) -> dict[str, Residuals]:
-    """Compute the residuals of values, by kind, given the indices of each kind's factors in the graph."""
+    """Compute the residuals at given values by kind; ``kinds`` gives the indices of each kind's factors."""
     found = {}
     for kind, indices in kinds.items():
         factors = [graph.at(index) for index in indices]
@@ -114,8 +114,9 @@ def solve(
 class Marginals:
     """Covariances of the values that solve a graph.
 
-    The variables are eliminated by nested dissection: the tree of a long chain is flat then, and the covariance of two
-    states of an hour takes as long as that of two of a minute. Each elimination is made when it is first needed.
+    The variables are eliminated in the order of nested dissection: the elimination tree of a long chain is then flat,
+    and the covariance of two states takes as long in a session of an hour as in one of a minute. Each elimination is
+    made when it is first needed.
 
     Raises:
         OptimizationError: if a variable is not constrained.
@@ -127,7 +128,7 @@ class Marginals:
         self._ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
 
     def poses(self, count: int) -> Float:
-        """Return the covariances (N, 6, 6) of the first poses, tangent ``[rotation, translation]`` in body."""
+        """Return the covariances (N, 6, 6) of the first N poses, tangent ``[rotation, translation]`` in body."""
         found = np.zeros((count, 6, 6))
         numbers = {x(k): k for k in range(count)}
         linear = self._graph.linearize(self._values)

@@ -1,7 +1,8 @@
 """Views of landmarks by single cameras as factors between the poses of a session's graph.
 
-The odometry hands over the views of each landmark once, with the landmark eliminated: a quadratic cost of the poses
-from which it was seen. It is used as a cost of these poses relative to the first of them, which loop closures may move.
+The odometry passes on the views of each landmark once, with the landmark eliminated: a quadratic cost of the poses from
+which it was seen. Here, this is a cost of these poses relative to the first of them, so that loop closures may move all
+of them together.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ from graphvio.arrays import Float, Int
 from graphvio.geometry import se3_adjoint, se3_compose, se3_inverse, se3_log
 from graphvio.measurements.window_views import WindowViews
 
-_MIN_SHARE = 1e-12  # of the largest eigenvalue: what is smaller is rounding
+_MIN_SHARE = 1e-12  # of the largest eigenvalue: smaller eigenvalues are due to rounding
 _MIN_STATES = 2
 _MIN_DIAGONAL = 1e-12
 
 
 class Views(NamedTuple):
-    """V costs of poses; the states of cost i are rows ``begins[i]`` to ``begins[i + 1]`` of the other columns."""
+    """V costs of poses as columns; the states of cost i are rows ``begins[i]`` to ``begins[i + 1]`` of the others."""
 
     begins: Int  # (V + 1,)
     row: Int  # (S,) rows of the framesets
     poses: Float  # (S, 4, 4) ``nav_T_body`` at which the cost was linearised
     gradient: Float  # (S, 6)
-    information: Float  # one after the other, (6 K)^2 numbers of a cost of K states
+    information: Float  # concatenated, (6 K)^2 numbers for a cost of K states
 
     def at(self, number: int) -> tuple[Int, Float, Float, Float]:
         """Return rows (K,), poses (K, 4, 4), information (6 K, 6 K) and gradient (6 K,) of a cost."""
@@ -40,7 +41,7 @@ class Views(NamedTuple):
 
     @staticmethod
     def of(given: Iterable[WindowViews], row_of: Mapping[int, int]) -> Views:
-        """Collect costs; poses of framesets that have no row are eliminated."""
+        """Collect costs; ``row_of`` gives the row of a stamp, and poses of framesets without one are eliminated."""
         kept = [each.of(np.array([int(ns) in row_of for ns in each.stamps_ns])) for each in given]
         kept = [each for each in kept if len(each.stamps_ns) >= _MIN_STATES]
         return Views(
@@ -56,10 +57,10 @@ def views_factor(keys: Sequence[int], poses: Float, information: Float, gradient
     """Return the factor of a cost between the poses of K states.
 
     Args:
-        keys: (K,) of the poses.
-        poses: (K, 4, 4) at which the cost was linearised.
-        information: (6 K, 6 K).
-        gradient: (6 K,).
+        keys: keys (K,) of the poses.
+        poses: poses (K, 4, 4) at which the cost was linearised.
+        information: information (6 K, 6 K) of the cost.
+        gradient: gradient (6 K,) of the cost.
     """
     root, offset = root_of(information[6:, 6:], gradient[6:])
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), list(keys), _error(root, offset, poses))
@@ -68,7 +69,7 @@ def views_factor(keys: Sequence[int], poses: Float, information: Float, gradient
 def root_of(information: Float, gradient: Float) -> tuple[Float, Float]:
     """Return A (M, N) and c (M,) with ``A^T A`` the information (N, N), and ``A^T c`` the gradient (N,).
 
-    Directions of which nothing is known are left out.
+    Directions without information are left out.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _MIN_DIAGONAL))  # units differ
     values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
@@ -79,11 +80,11 @@ def root_of(information: Float, gradient: Float) -> tuple[Float, Float]:
 
 
 class RelativePoses:
-    """Changes of poses relative to the first of them, as columns of an error ``root d + offset``.
+    """Changes of poses relative to the first of them, as a part of d in an error ``root d + offset``.
 
     Args:
-        root: (M, N) whose first 6 (K - 1) columns are of these changes.
-        poses: (K, 4, 4) from which they count.
+        root: matrix (M, N) whose first 6 (K - 1) columns multiply these changes.
+        poses: poses (K, 4, 4) from which the changes are counted.
     """
 
     def __init__(self, root: Float, poses: Float) -> None:
@@ -96,8 +97,8 @@ class RelativePoses:
         Args:
             residual: changed in place.
             poses: ``nav_T_body`` as they are now.
-            derivatives: with respect to each pose, of which all but the first are filled in; None where not
-                needed.
+            derivatives: list of the derivatives with respect to each pose, in which all but the first are filled in;
+                None where not needed.
 
         Returns:
             Derivative (M, 6) with respect to the first pose; zero without derivatives.
@@ -117,7 +118,7 @@ class RelativePoses:
 def _error(
     root: Float, offset: Float, poses: Float
 ) -> Callable[[gtsam.CustomFactor, gtsam.Values, list[Float] | None], Float]:
-    """Return the error ``root d + offset`` with its derivatives; d are changes of the poses relative to the first."""
+    """Return the error ``root d + offset`` with its derivatives; d is the change of the poses relative to the first."""
     relative = RelativePoses(root, poses)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:

@@ -22,7 +22,7 @@ class Workspace:
     """A folder of results that are written stage by stage.
 
     Args:
-        folder: made if missing; otherwise that of an optimisation of the same inputs.
+        folder: the folder: made if missing; otherwise that of an optimisation of the same inputs.
         inputs: name -> value of everything that determines the results.
 
     Raises:
@@ -53,7 +53,7 @@ class Workspace:
         """Keep other processes from continuing in the folder.
 
         Raises:
-            OptimizationError: if another process does so.
+            OptimizationError: if another process has it locked.
         """
         descriptor = os.open(self.folder, os.O_RDONLY)
         try:
@@ -79,12 +79,12 @@ class Workspace:
         self._save()
 
     def forget(self, stage: str) -> None:
-        """Let a stage be done once more."""
+        """Mark a stage as not finished, so that it is done again."""
         if self._finished.pop(stage, None) is not None:
             self._save()
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, which is whole or absent."""
+        """Write a file of the folder, which is whole or absent."""
         path = self.folder / name
         with writing(path, OptimizationError, _REMEDY):
             path.parent.mkdir(parents=True, exist_ok=True)

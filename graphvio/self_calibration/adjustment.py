@@ -13,9 +13,9 @@ from graphvio.self_calibration.pixel_noise import noise_of_views
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, choose_tracks, stationary
 
-_MAX_TRACKS = 150  # of each pair
+_MAX_TRACKS = 150  # of each pair or single camera
 _MAX_SELECTIONS = 2  # how often landmarks that move are left out
-_MIN_STATIONARY, _ALL_STATIONARY = 0.5, 0.98  # they are if the share of those that stand still is between these
+_MIN_STATIONARY, _ALL_STATIONARY = 0.5, 0.98  # share that stands still: in between, the others are left out
 _MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 
 
@@ -30,11 +30,11 @@ def adjusted(
     """Adjust a window, beginning at the odometry's poses and at a difference from the nominal calibration.
 
     Args:
-        keyframes: of the window, in time order.
-        samples: of the IMU over it, or None.
+        keyframes: keyframes of the window, in time order.
+        samples: IMU samples over the window, or None.
         nominal: calibration of the rig file.
-        difference: (C,) of the calibration from it, to begin at.
-        prior: of that difference.
+        difference: (C,) initial difference of the calibration from the nominal one.
+        prior: prior of that difference.
         sigma_px: noise of a corner's position.
 
     Returns:
@@ -54,15 +54,15 @@ def adjusted(
         stands = stationary(tracks, solution.errors2)
         if not _MIN_STATIONARY < np.mean(stands) < _ALL_STATIONARY:
             break
-        # From the first poses again: a crowd has taken those that were found along.
+        # From the first poses again: moving landmarks, as of a crowd, have biased those that were found.
         tracks, states = tracks.of(stands), states._replace(landmarks=states.landmarks[stands])
         solution = solve(Window(tracks, samples), states, nominal, difference, prior)
-    # Errors that have no minimum yet do not show noise, but a rig that is wrong beyond what is estimated.
+    # Without convergence, errors are not noise, but those of a rig that is wrong beyond what is estimated.
     noise_px = noise_of_views(tracks, solution.errors2) if solution.has_converged else tracks.sigma_px
     outliers = np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2)  # single samples, or an axis that sticks
     if samples is not None and len(outliers):
         samples = samples.without(outliers)
-    if len(outliers):  # from the first states again, which they have not taken along
+    if len(outliers):  # from the first states again, which they have not biased
         solution = solve(Window(tracks._replace(sigma_px=noise_px), samples), states, nominal, difference, prior)
     elif not np.array_equal(noise_px, tracks.sigma_px):
         window = Window(solution.window.tracks._replace(sigma_px=noise_px), samples)

@@ -1,8 +1,9 @@
 """Self-calibration from a whole recording: all windows at once, with one calibration that does not change.
 
-Each window is adjusted with what the windows before it say, and in later rounds also with what those after it say
-(expectation propagation; T. Minka, *Expectation propagation for approximate Bayesian inference*, 2001), so that all are
-linearised at nearly the same calibration and none is counted twice. The IMU's biases alone change between windows.
+Each window is adjusted with the evidence of the windows before it as the prior, and in later rounds also with that of
+the windows after it (expectation propagation; T. Minka, *Expectation propagation for approximate Bayesian inference*,
+2001), so that all are linearised at nearly the same calibration and none is counted twice. Only the IMU's biases change
+between windows.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from graphvio.self_calibration.parameters import RigCalibration
 from graphvio.self_calibration.prior import file_prior, walk_per_second
 
 _ROUNDS = 2
-_STILL = 1e-5  # share of the file's standard deviations that the calibration changes in one second: next to nothing
+_STILL = 1e-5  # random walk in one second, as a share of the file's standard deviations: next to nothing
 _NO_GAIN = -np.inf
 
 
 class Batch(NamedTuple):
-    """What the windows of a recording say together.
+    """Result of all windows of a recording.
 
     Attributes:
-        estimate: of the calibration.
-        evidence: of all windows that are used.
-        prior: of the rig file.
-        history: the estimate from longer and longer beginnings of the recording, with the stamp of their end.
+        estimate: estimate of the calibration.
+        evidence: evidence of all windows that are used.
+        prior: prior by the rig file.
+        history: estimates from longer and longer beginnings of the recording, with the stamp of their end.
         left_out: (K,) whether each window is not used: it contradicts the others, or its adjustment has not converged.
     """
 
@@ -53,10 +54,10 @@ def calibrate_windows(
     """Estimate the calibration from windows.
 
     Args:
-        rig: of the rig file; its standard deviations say how far each parameter may differ from it.
-        windows: K of them in time order, at least one.
-        difference: (C,) first guess of the difference from the rig.
-        on_window: called with the number of windows adjusted and that of all adjustments.
+        rig: rig of the rig file; its standard deviations say how far each parameter may differ from it.
+        windows: K windows in time order, at least one.
+        difference: (C,) first guess of the difference from the rig file.
+        on_window: called after each adjustment, with the number of adjustments done and that of all.
     """
     prior, nominal, n = file_prior(rig), RigCalibration.of(rig), len(windows)
     factors = np.ones(prior.n_groups)
@@ -87,10 +88,10 @@ def calibrate_windows(
 def difference_of(one: Batch, other: Batch) -> tuple[Float, Float]:
     """Return by how much two calibrations of a rig from different windows differ, and the covariance of that.
 
-    Both share the rig file's prior; where that is all they have, they agree.
+    Both share the rig file's prior, which adds nothing to the difference: parameters that it alone determines agree.
 
     Returns:
-        The difference (C,), and its covariance (C, C) if both are right.
+        The difference (C,), and the covariance (C, C) that it has if both are right.
     """
     of_file = one.prior.with_factors(np.maximum(_factors(one.prior, one.evidence), _factors(one.prior, other.evidence)))
     gains, noise = [], np.zeros_like(of_file)
@@ -112,13 +113,13 @@ def _estimate(rig: Rig, prior: FilePrior, evidence: Evidence) -> CalibrationEsti
 
 
 def _factors(prior: FilePrior, evidence: Evidence) -> Float:
-    """Return the factors of the file's errors, at least 1: what is not shown is no better known than by the file."""
+    """Return the likeliest factors (G,) on the file's errors, at least 1: unseen parts are known as by the file."""
     factors, _ = evidence.file_factors(prior, np.full(prior.n_groups, _NO_GAIN))
     return np.maximum(factors, 1.0)
 
 
 def _site(others: Gaussian, posterior: Gaussian) -> Evidence:
-    """Return what a window says beyond the others."""
+    """Return the evidence of one window: what the posterior contains beyond the others' evidence and the prior."""
     return Evidence.none(len(others.mean)).with_window(others, posterior)
 
 
@@ -127,7 +128,7 @@ def _sum(one: Evidence, other: Evidence) -> Evidence:
 
 
 def _of_later(sites: Sequence[Evidence], walks: Sequence[Float]) -> list[Evidence]:
-    """Return what the windows after each one say of the calibration at its time."""
+    """Return the evidence of the windows after each one about the calibration at its time."""
     later = [Evidence.none(len(sites[0].vector))]
     for site, walk in zip(reversed(sites[1:]), reversed(walks[:-1]), strict=True):
         later.append(_sum(later[-1], site).after_random_walk(walk))
@@ -135,6 +136,6 @@ def _of_later(sites: Sequence[Evidence], walks: Sequence[Float]) -> list[Evidenc
 
 
 def _walk_after(windows: Sequence[FullWindow], k: int, per_second: Float) -> Float:
-    """Return the covariance (C, C) of what changes from a window to the next one: the biases."""
+    """Return the covariance (C, C) of the random walk from a window to the next one, almost only of the biases."""
     following = windows[min(k + 1, len(windows) - 1)]
     return per_second * max((following.keyframes[0].stamp_ns - windows[k].keyframes[0].stamp_ns) * 1e-9, 1.0)

@@ -17,8 +17,8 @@ from graphvio.self_calibration.moving_landmarks import move_landmark
 from graphvio.self_calibration.observation import COLUMNS, ERROR_AT, POINT, POINT_AT, POSE, new_scratch, observe
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
-_ERROR2_BEHIND = 1e6  # of a landmark behind the camera
-_MAX_FARTHER = 0.5  # see `move_landmark`: stereo cameras see points that are nearly infinite
+_ERROR2_BEHIND = 1e6  # squared whitened error of a landmark behind the camera
+_MAX_FARTHER = 0.5  # see `move_landmark`: stereo cameras see points that are nearly at infinity
 
 
 class Tracks(NamedTuple):
@@ -26,12 +26,12 @@ class Tracks(NamedTuple):
 
     Attributes:
         pair: (L,) index of the pair or single camera that sees each landmark.
-        odom_T_landmark: (L, 4, 4) frame of each.
+        odom_T_landmark: (L, 4, 4) frame of each landmark.
         rows: (L + 1,) the observations of landmark l are ``rows[l]`` to ``rows[l + 1]``.
-        keyframe: (N,) index.
-        left_px: (N, 2).
-        right_px: (N, 2).
-        has_right: (N,).
+        keyframe: (N,) index of the keyframe.
+        left_px: (N, 2) pixels in the left image.
+        right_px: (N, 2) pixels in the right image; meaningful where ``has_right``.
+        has_right: (N,) whether the landmark was found there.
         sigma_px: (N,) noise of each observation's corners.
     """
 
@@ -45,7 +45,7 @@ class Tracks(NamedTuple):
     sigma_px: Float
 
     def of(self, kept: Bool) -> "Tracks":
-        """Return those of the landmarks (L,) that are kept."""
+        """Return the tracks of the landmarks (L,) that are kept."""
         rows, begins = rows_of(self.rows, kept)
         return Tracks(
             self.pair[kept],
@@ -71,11 +71,11 @@ def rows_of(rows: Int, kept: Bool) -> tuple[Bool, Int]:
 
 
 class Eliminated(NamedTuple):
-    """What the elimination of the landmarks leaves behind, to find them again.
+    """Terms of the landmarks' elimination, from which the landmarks' own step follows.
 
     Attributes:
-        inverse: (L, 3, 3) of their normal matrices.
-        gradient: (L, 3).
+        inverse: (L, 3, 3) inverse of each landmark's normal matrix.
+        gradient: (L, 3) gradient of the cost with respect to each landmark.
         by_calibration: (L, 3, PAIR) coupling with the pair's calibration.
         by_pose: (N, 3, 6) coupling of each observation with its keyframe.
     """
@@ -102,15 +102,15 @@ def eliminate_landmarks(
     poses: Float, calibration: RigCalibration, landmarks: Float, tracks: Tracks, scale: float, damping: float,
     hessian: Float, gradient: Float, eliminated: Eliminated,
 ) -> tuple[float, Float]:  # fmt: skip
-    """Add the normal equations of poses and calibration, landmarks eliminated.
+    """Add the normal equations of poses and calibration by the reprojection errors, with the landmarks eliminated.
 
     Args:
         poses: (K, 4, 4) ``odom_T_body``; perturbed on the right, ``R Exp(r)``, ``p + R t``.
-        calibration: of P pairs.
+        calibration: calibration of P pairs and single cameras.
         landmarks: (L, 3).
-        tracks: of these.
-        scale: of the Cauchy cost, in whitened units.
-        damping: of the landmarks' normal matrices, relative.
+        tracks: observations of the landmarks.
+        scale: scale of the Cauchy cost, in whitened units.
+        damping: damping of the landmarks' normal matrices, relative.
         hessian: (6 K + P PAIR, 6 K + P PAIR), upper and lower triangle, is added to.
         gradient: (6 K + P PAIR,) is added to.
         eliminated: output.
@@ -176,7 +176,7 @@ def _add(
     """Add one observation: to the equations of its pose, and to the sums of its landmark.
 
     Args:
-        rows: (4, COLUMNS) of the observation.
+        rows: (4, COLUMNS) rows of the observation, see `observe`.
         weighted: the same times its weight.
         at_pose: column of the pose in the normal equations.
         at_pair: column of the pair's calibration.
@@ -203,7 +203,7 @@ def _add(
         if a0 != 0.0 or a1 != 0.0:
             for d in range(COLUMNS):
                 total[d] += a0 * r0[d] + a1 * r1[d] + a2 * r2[d] + a3 * r3[d]
-        elif a2 != 0.0 or a3 != 0.0:  # what belongs to the right image alone
+        elif a2 != 0.0 or a3 != 0.0:  # parameters of the right image alone
             for d in range(COLUMNS):
                 total[d] += a2 * r2[d] + a3 * r3[d]
 
@@ -213,18 +213,18 @@ def _eliminate(
     point: int, at: int, tracks: Tracks, totals: Float, damping: float, of_poses: Float, hessian: Float,
     gradient: Float, eliminated: Eliminated,
 ) -> None:  # fmt: skip
-    """Eliminate a landmark, and add what its observations say of the pair's calibration.
+    """Eliminate a landmark, and add its observations to the equations of the pair's calibration.
 
     Args:
-        point: the landmark.
+        point: index of the landmark.
         at: column of the pair's calibration in the normal equations.
-        tracks: of all landmarks.
+        tracks: observations of all landmarks.
         totals: sums over its observations, see `_add`.
-        damping: of its normal matrix, relative.
+        damping: damping of its normal matrix, relative.
         of_poses: (3, 6 K) scratch.
         hessian: is changed.
         gradient: is changed.
-        eliminated: output; it has the landmark's couplings with the poses.
+        eliminated: output; its couplings of the landmark with the poses are input.
     """
     first, last = tracks.rows[point], tracks.rows[point + 1]
     v, vb, vwc = np.zeros((3, 3)), np.zeros(3), np.zeros((3, PAIR))
@@ -275,7 +275,7 @@ def _eliminate(
 
 @kernel
 def _lines(rows: Float) -> tuple[Float, Float, Float, Float]:
-    """Return the four lines of a matrix."""
+    """Return the four rows of a matrix."""
     return rows[0], rows[1], rows[2], rows[3]
 
 
@@ -302,12 +302,12 @@ def landmarks_after(
 
     Args:
         landmarks: (L, 3) before.
-        tracks: of these.
-        calibration: of P pairs, before.
+        tracks: observations of the landmarks.
+        calibration: calibration of P pairs and single cameras, before.
         poses: (K, 4, 4) ``odom_T_body``, before.
         moved_poses: (K, 4, 4) after.
-        eliminated: what the elimination of the landmarks left behind.
-        step: (6 K + P PAIR,) of poses and calibration.
+        eliminated: terms of the landmarks' elimination.
+        step: (6 K + P PAIR,) step of poses and calibration.
     """
     moved, frames = np.empty_like(landmarks), tracks.odom_T_landmark.copy()
     b, work = np.zeros(3), np.zeros((4, 3))

@@ -1,4 +1,4 @@
-"""Windows of keyframes for the self-calibration, and the IMU samples over them."""
+"""Collection of keyframes in windows for the self-calibration, with the IMU samples over them."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe:
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
 _MAX_IMU_GAP_NS = 50_000_000
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
-_HELD_NS = 30_000_000  # a time offset that is wrong by more is found over later windows
+_HELD_NS = 30_000_000  # of readings at the ends; a time offset that is wrong by more is found over later windows
 _HELD_NOISE_FACTOR = 100.0  # on the variance of a reading that is held
-_KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
+_KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands may have no keyframes for hours
 
 
 class FullWindow(NamedTuple):
     """Measurements of a window that is full.
 
     Attributes:
-        keyframes: in time order.
-        samples: of the IMU, or None.
+        keyframes: keyframes, in time order.
+        samples: IMU samples over it, or None.
         sigma_px: noise of a corner's position, as it is known from the windows before.
     """
 
@@ -44,10 +44,10 @@ class WindowCollector:
     """Collects keyframes while the images move; windows share no keyframe.
 
     Args:
-        rig: of the rig file, with the IMU's noise and time offset.
+        rig: rig of the rig file, with the IMU's noise and time offset.
 
     Attributes:
-        keyframes: of the window that grows.
+        keyframes: keyframes of the window that is being collected.
         stamp_sigma_s: standard deviation of the framesets' stamps.
     """
 
@@ -65,7 +65,7 @@ class WindowCollector:
             self._samples.popleft()
 
     def is_keyframe(self, stamp_ns: int, views: Mapping[int, View], interval_s: float) -> bool:
-        """Whether the images have moved, and the interval has passed, since the last keyframe."""
+        """Return whether the images have moved, and the interval has passed, since the last keyframe."""
         last = self._last
         if last is None or not views:
             return bool(views)
@@ -82,11 +82,11 @@ class WindowCollector:
         self.keyframes.append(self._last)
 
     def begin_window(self) -> None:
-        """Begin a window without keyframes; the next one has to be apart from the last keyframe all the same."""
+        """Begin a window without keyframes; its first one still has to be apart from the last keyframe before it."""
         self.keyframes = []
 
     def restart(self) -> None:
-        """Discard the window that is not full: the poses that come are in another frame, or their clock is another."""
+        """Discard the unfinished window: later poses are in another frame, or their stamps are of another clock."""
         self.keyframes, self._last = [], None
 
     def forget_samples(self) -> None:
@@ -94,7 +94,7 @@ class WindowCollector:
         self._samples.clear()
 
     def samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
-        """Return the IMU over a window, or None where there is none; older samples are forgotten."""
+        """Return the IMU samples over a window, or None where there are none; older samples are forgotten."""
         if self._imu is None:
             return None
         first_ns = window[0].stamp_ns + self._imu.time_offset_ns - _MARGIN_NS
@@ -117,9 +117,10 @@ class WindowCollector:
 
 
 def _with_held_ends(samples: InertialSamples) -> InertialSamples:
-    """Return samples whose first and last readings are held for longer, where a time offset may ask for that.
+    """Return samples whose first and last readings are held for longer, if another time offset would need more samples.
 
-    An IMU that begins with the images, or the last frameset, would else lose an interval as the offset is found.
+    Without that, where the IMU begins with the images or a window ends with the last frameset, the search for the
+    offset would lose an interval.
     """
     stamps, readings, factors = samples.stamps_ns, samples.readings, samples.noise_factors
     if stamps[0] > samples.keyframes_ns[0] - _HELD_NS:
@@ -133,11 +134,11 @@ def _with_held_ends(samples: InertialSamples) -> InertialSamples:
 
 
 def _noise_of_stamps(window: tuple[Keyframe, ...], rates: Float, sigma_s: float) -> Float:
-    """Return white noise densities (2,) of gyro and accelerometer that err as much as the stamps of keyframes do.
+    """Return white noise densities (2,) of gyro and accelerometer that have the effect of noisy stamps of keyframes.
 
     Args:
         window: K keyframes.
-        rates: (N, 3) angular velocities over it.
+        rates: (N, 3) angular velocities over the window.
         sigma_s: standard deviation of the stamps.
     """
     if sigma_s == 0.0 or len(window) < 2:
@@ -146,7 +147,7 @@ def _noise_of_stamps(window: tuple[Keyframe, ...], rates: Float, sigma_s: float)
     steps_m = np.diff([keyframe.odom_T_body[:3, 3] for keyframe in window], axis=0)
     dt, rate2 = float(np.median(intervals_s)), np.mean(np.sum(rates**2, axis=1))
     speed2 = np.mean(np.sum(steps_m**2, axis=1) / intervals_s**2)
-    # By an interval that is longer than its stamps say, the rig turns and moves on; white noise of the accelerometer
-    # moves it by a third of its variance times the cube of the interval.
+    # In an interval that is longer than its stamps say, the rig turns and moves by more. White noise of the
+    # accelerometer adds a third of its squared density times the cube of the interval to the position's variance.
     longer2 = 2.0 * sigma_s**2
     return np.asarray(np.sqrt([longer2 * rate2 / dt, 3.0 * longer2 * speed2 / dt**3]))

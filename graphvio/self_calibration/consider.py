@@ -1,10 +1,11 @@
 """What errors of the calibration add to the pose's covariance: consider states.
 
-A wrong calibration bends all motions alike. As noise of each motion it would average out, and the pose would look far
-better known than it is. Here the pose's error is instead ``e = G c + m``, with the error `c` of the calibration that is
-in force now, by which every motion was wrong in its own way, and what its corrections left behind, since poses are not
-corrected with it. Neither is estimated, both are considered (S. F. Schmidt, *Application of state-space methods to
-navigation problems*, 1966; B. D. Tapley et al., *Statistical orbit determination*, 2004, section 6).
+A wrong calibration has the same effect on all motions. As noise of each motion it would average out, and the pose would
+seem far better known than it is. Here the pose's error is instead ``e = G c + m``. `c` is the error of the calibration
+that is in force now, and `G` the sum of its effects on all motions; `m` is the error that earlier calibrations left
+behind, since poses are not corrected when the calibration is. Neither is estimated, both are considered (S. F. Schmidt,
+*Application of state-space methods to navigation problems*, 1966; B. D. Tapley et al., *Statistical orbit
+determination*, 2004, section 6).
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from graphvio.arrays import Float
 from graphvio.self_calibration.motion_gains import PoseGain, error_transport
 from graphvio.self_calibration.window import Keyframe
 
-_GAIN_ERROR = 0.2  # of what a `PoseGain` says, in all directions: it is an approximation
+_GAIN_ERROR = 0.2  # relative error of a `PoseGain`, in all directions: it is an approximation
 
 
 class ConsiderCovariance:
-    """Covariance of the pose that comes from the calibration of the cameras.
+    """Covariance of the pose that is due to the calibration of the cameras.
 
     Errors of a pose are in its own frame (tangent ``[rotation, translation]``).
 
@@ -33,17 +34,18 @@ class ConsiderCovariance:
         self._newest: Keyframe | None = None
         self._gain = np.zeros((6, n))  # G, at the newest keyframe
         self._left_behind = np.zeros(6)  # m
-        self._before_knock = np.zeros((6, 6))  # covariance of what has nothing to do with the calibration now
-        self._difference = np.zeros(n)  # of the calibration in force from the rig file
-        self._covariance = np.zeros((n, n))  # of c
+        self._before_knock = np.zeros((6, 6))  # covariance of the error from before a knock, independent of c now
+        self._difference = np.zeros(n)  # difference of the calibration in force from the rig file
+        self._covariance = np.zeros((n, n))  # covariance of c
 
     def extend(self, keyframes: Sequence[Keyframe], by_cameras: Float) -> None:
         """Carry the pose's error on to the newest keyframe of a window.
 
         Args:
-            keyframes: K of them. Those up to the newest one that is known already count no second time; one that
-                follows the window before is as far from it as the keyframes of this one from each other.
-            by_cameras: (K, 6, N) derivatives of the window's poses, of which the first stays, with respect to the
+            keyframes: K keyframes of the window. The motion up to the newest one that is already known is not counted
+                again. If that is not among them, the first of them is taken to be as far from it as they are from each
+                other.
+            by_cameras: (K, 6, N) derivatives of the window's poses, of which the first is fixed, with respect to the
                 calibration.
         """
         newest = keyframes[-1]
@@ -68,8 +70,8 @@ class ConsiderCovariance:
         """Set the calibration that is in force from now on.
 
         Args:
-            difference: (N,) from the rig file.
-            covariance: (N, N) of it.
+            difference: (N,) difference of this calibration from the rig file.
+            covariance: (N, N) covariance of its error.
             since: how the newest pose depends on the calibration since `newest_ns`, or None if that is not known: the
                 motions until now were measured with the calibration before.
         """
@@ -89,7 +91,7 @@ class ConsiderCovariance:
         self._gain, self._left_behind = np.zeros_like(self._gain), np.zeros(6)
 
     def at(self, odom_T_body: Float, since: PoseGain | None = None) -> Float:
-        """Return the covariance (6, 6) that it adds to a pose.
+        """Return the covariance (6, 6) that errors of the calibration add to a pose.
 
         Args:
             odom_T_body: (4, 4) pose, not far from the newest keyframe.
@@ -117,9 +119,9 @@ class ConsiderCovariance:
 
 
 def _second_order(error: Float) -> Float:
-    """Return the covariance (6, 6) of what derivatives do not say of a pose's error (6,), as its size bounds it.
+    """Return the covariance (6, 6) of the second-order terms of a pose's error (6,), as its size bounds them.
 
-    They were taken at poses that were turned by that error themselves.
+    The derivatives were taken at poses that were themselves turned by that error.
     """
     angle, distance = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     return np.diag(np.repeat([angle * angle, angle * distance], 3) ** 2)

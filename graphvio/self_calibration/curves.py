@@ -1,4 +1,4 @@
-"""The calibration as curves for people: single numbers in handy units, in groups of what belongs together."""
+"""The calibration as curves for plots: single numbers in convenient units, in groups of what belongs together."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Curve(NamedTuple):
     """One number of the calibration.
 
     Attributes:
-        group: such as ``focal lengths``.
-        unit: of the number; empty where it has none.
+        group: what it belongs to, such as ``focal lengths``.
+        unit: unit of the number; empty where it has none.
         item: the camera, pair or sensor; empty where the group has one only.
-        component: such as ``fx`` or an axis; empty where the item has one only.
-        row: (C,) whose product with a difference from the rig file is the number.
+        component: which number of the item, such as ``fx`` or an axis; empty where it has one only.
+        row: (C,) vector whose product with a difference from the rig file is the number.
     """
 
     group: str
@@ -52,7 +52,7 @@ class Curve(NamedTuple):
 
 
 def curves_of(rig: Rig) -> list[Curve]:
-    """Return the curves of a rig, those of a group in succession; biases are not among them."""
+    """Return the curves of a rig, group after group; the IMU's biases are not among them."""
     by_group: dict[str, list[Curve]] = {}
     for curve in (*_of_cameras(rig), *_of_pairs(rig), *_of_singles(rig), *_of_imu(rig)):
         by_group.setdefault(curve.group, []).append(curve)
@@ -60,14 +60,14 @@ def curves_of(rig: Rig) -> list[Curve]:
 
 
 def values_of(curves: list[Curve], estimate: CalibrationEstimate) -> tuple[Float, Float]:
-    """Return the differences (N,) from the rig file that N curves have now, and their standard deviations (N,)."""
+    """Return the current differences (N,) of N curves from the rig file, and their standard deviations (N,)."""
     rows = np.array([curve.row for curve in curves])
     variances = np.einsum("nc,cd,nd->n", rows, estimate.posterior.covariance, rows)
     return rows @ estimate.difference, np.sqrt(np.maximum(variances, 0.0))
 
 
 def with_sigma(value: float, sigma: float) -> str:
-    """Format a number and its standard deviation, to two digits of the latter."""
+    """Format a number and its standard deviation, with two digits of the latter."""
     decimals = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0.0 else 3
     return f"{value:+.{decimals}f} ± {sigma:.{decimals}f}"
 

@@ -1,4 +1,4 @@
-"""What is known of a rig's calibration at one moment of a run."""
+"""Estimate of a rig's calibration at one moment of a run."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from graphvio.self_calibration.prior import refined_sigmas
 
 @dataclass(frozen=True, eq=False)
 class CalibrationEstimate:
-    """The calibration of a rig, as the rig file and the measurements have it.
+    """Estimate of a rig's calibration by the rig file and the measurements.
 
     Attributes:
         file_rig: the rig of the file.
-        posterior: of the difference from it (see `graphvio.self_calibration.parameters`), if no part is exact.
-        difference: (C,) that is in force, with zero for what is exact.
-        file_factors: (G,) by which factors the file's errors exceed their standard deviations: of intrinsics and
-            stereo extrinsics, and of extrinsics in body and the IMU. `EXACT` where the file is as good as exact.
+        posterior: posterior of the difference from it (see `graphvio.self_calibration.parameters`), if no part is
+            exact.
+        difference: (C,) difference that is in force, with zero for parts that are exact.
+        file_factors: (G,) factors by which the file's errors exceed their standard deviations: of intrinsics and stereo
+            extrinsics, and of extrinsics in body and the IMU. `EXACT` where the file is as good as exact.
         twice_log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is
             very strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
         is_changed: whether a knock has changed the cameras since the file was made.
@@ -39,7 +40,7 @@ class CalibrationEstimate:
 
     @property
     def is_file_exact(self) -> bool:
-        """Whether the measurements say nothing against the rig file, which then stays in force."""
+        """Whether the measurements do not contradict the rig file, which then stays in force."""
         return not self.is_changed and bool((self.file_factors == EXACT).all())
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What the measurements say of the calibration, and how wrong they say that the rig file is."""
+"""Evidence of the measurements about the calibration, and estimates of how wrong the rig file is."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from graphvio.arrays import Float, Int
 from graphvio.linear_algebra import cholesky, inverse, solve_lower
 
 EXACT = 1e-3
-"""Factor on the file's standard deviations of a file that is as good as exact."""
+"""Factor on the standard deviations of a rig file that is as good as exact."""
 _SWEEPS = 3
-_MIN_WEIGHT = 1e-5  # over the likeliest factors', of those that count in a mean over all
-_MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
+_MIN_WEIGHT = 1e-5  # relative to the likeliest factors, of factors that count in a mean over all
+_MAX_MEAN_INNOVATION = 3.0  # mean square over the parameters; 1 where all errors are as modelled
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 MAX_FACTOR = _FACTORS[-1]
 MIN_TWICE_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
-"""Against exact files, of intrinsics and of extrinsics with the IMU.
+"""Thresholds for evidence against an exact file, of intrinsics and of extrinsics with the IMU.
 
-Cameras that are not exact reach hundreds with the first image.
+Cameras whose calibration is not exact reach hundreds with the first image.
 """
 
 
 def inexact(factors: Float) -> Float:
-    """Return the factors (G,) without those of exact parts, which may yet turn out to be wrong."""
+    """Return the factors (G,) with 1 instead of `EXACT`, since exact parts may yet turn out to be wrong."""
     return np.where(factors == EXACT, 1.0, factors)
 
 
@@ -52,7 +52,7 @@ class Gaussian(NamedTuple):
         return float(0.5 * off @ self.information @ off)
 
     def is_confirmed_by(self, posterior: Gaussian) -> bool:
-        """Return whether the posterior mean is within this prior: squared Mahalanobis distance below 3 a parameter."""
+        """Return whether a posterior mean is within this prior: squared Mahalanobis distance below 3 per parameter."""
         return 2.0 * self.cost(posterior.mean) < _MAX_MEAN_INNOVATION * len(self.mean)
 
     def agrees_with(self, other: Gaussian) -> bool:
@@ -63,14 +63,14 @@ class Gaussian(NamedTuple):
 
 
 class FilePrior(NamedTuple):
-    """What is known of the calibration from the rig file, up to a factor on the standard deviations of each group.
+    """Prior of the calibration by the rig file, up to a factor on the standard deviations of each group.
 
     Attributes:
-        covariance: (C, C) of the differences from the file, for factors of 1.
-        group: (C,) index of the factor of each parameter, or -1 where none applies: no file has biases.
-        change: (C, C) covariance of what knocks have changed since the file was made, or None. No factor applies to it.
-        estimated: whether an estimation found the file's standard deviations. Factors are 1 at least then: what it did
-            not show is as wrong as before, however well it found the parts that measurements show again.
+        covariance: (C, C) covariance of the differences from the file, for factors of 1.
+        group: (C,) index of the factor of each parameter, or -1 for biases, which have none: no file contains them.
+        change: (C, C) covariance of changes by knocks since the file was made, or None. No factor applies to it.
+        estimated: whether an estimation found the file's standard deviations. Factors are then at least 1: what that
+            estimation did not show is as wrong as before, however well it found the parts that measurements show again.
     """
 
     covariance: Float
@@ -80,17 +80,17 @@ class FilePrior(NamedTuple):
 
     @property
     def factors(self) -> tuple[float, ...]:
-        """Factors that are possible, of any group, from the smallest one."""
+        """Possible factors of any group, from the smallest one."""
         return tuple(factor for factor in _FACTORS if factor >= 1.0) if self.estimated else _FACTORS
 
     @property
     def smallest_factors(self) -> Float:
-        """The factors (G,) of a file that measurements say nothing against: `EXACT`, or 1 where it is estimated."""
+        """The factors (G,) of a file that measurements do not contradict: `EXACT`, or 1 where it is estimated."""
         return np.full(self.n_groups, self.factors[0])
 
     @property
     def n_groups(self) -> int:
-        """Number of factors."""
+        """Number G of groups, and so of factors."""
         return int(self.group.max()) + 1
 
     def with_factors(self, factors: Float) -> Float:
@@ -104,7 +104,7 @@ class FilePrior(NamedTuple):
         return self._replace(change=change if self.change is None else self.change + change)
 
     def of_each(self, factors: Float) -> Float:
-        """Return each parameter's factor (C,), of the groups' factors (G,)."""
+        """Return the factor (C,) that applies to each parameter, from the groups' factors (G,)."""
         padded = np.ones(len(factors) + 1)
         padded[:-1] = factors
         return np.asarray(padded[self.group])  # group -1, without a factor, selects the last 1.0
@@ -142,7 +142,7 @@ class Evidence(NamedTuple):
         return Evidence(0.5 * (information + information.T), kept @ self.vector)
 
     def with_window(self, prior: Gaussian, posterior: Gaussian) -> Evidence:
-        """Return the likelihood with what turned a prior into a posterior."""
+        """Return the likelihood with that of a window, which has turned a prior into a posterior."""
         return Evidence(
             self.information + posterior.information - prior.information,
             self.vector + posterior.information @ posterior.mean - prior.information @ prior.mean,
@@ -157,10 +157,10 @@ class Evidence(NamedTuple):
         1992), and one group after the other is varied, in turns until none changes.
 
         Args:
-            prior: of the calibration.
+            prior: prior of the calibration.
             min_twice_log_ratios: (G,) threshold on twice the log likelihood ratio against the smallest factor, above
                 which a larger one is taken.
-            likelihood: of the same evidence and prior, if there is one already.
+            likelihood: likelihood for the same evidence and prior, if there is one already.
 
         Returns:
             The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
@@ -168,7 +168,7 @@ class Evidence(NamedTuple):
         """
         likelihood = likelihood or FactorLikelihood(self, prior)
         groups = list(range(prior.n_groups))
-        # Two groups may explain the same, and the one that is varied first then takes it all: each is first once.
+        # Two groups may explain the same errors, and the first one that is varied then takes all: each is first once.
         orders = [groups[first:] + groups[:first] for first in groups]
         maxima = [_ascended(likelihood, prior, order, min_twice_log_ratios) for order in orders]
         factors = max(maxima, key=likelihood)
@@ -178,7 +178,8 @@ class Evidence(NamedTuple):
         """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
 
         It is the mean over all factors of the file, each weighted by its likelihood, even while the file is in force as
-        if it were exact: what nothing has shown yet may be as wrong as any file is. For arguments see `file_factors`.
+        if it were exact: parameters that nothing has shown yet may be as wrong as in any file. For arguments see
+        `file_factors`.
 
         Raises:
             numpy.linalg.LinAlgError: if the measurements have no likelihood with any factors.
@@ -200,8 +201,8 @@ class FactorLikelihood:
     """Marginal likelihood of factors on a rig file's standard deviations; each is computed once.
 
     Args:
-        evidence: of the measurements.
-        prior: of the rig file.
+        evidence: evidence of the measurements.
+        prior: prior by the rig file.
     """
 
     def __init__(self, evidence: Evidence, prior: FilePrior) -> None:
@@ -255,7 +256,7 @@ def _ascended(
 
 
 def _factors_that_count(likelihood: FactorLikelihood, prior: FilePrior) -> list[Float]:
-    """Return the factors (G,) whose likelihood is not negligible, found from the maxima outwards.
+    """Return all factors (G,) whose likelihood is not negligible, searched from the maxima outwards.
 
     Raises:
         numpy.linalg.LinAlgError: if no factors have a likelihood.

@@ -1,4 +1,4 @@
-"""What the self-calibration found, part by part, in terms of the rig file: differences, certainty, significance."""
+"""Result of the self-calibration, part by part: differences from the rig file, their uncertainty and significance."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from graphvio.self_calibration.parameters import (
 from graphvio.self_calibration.prior import SINGLE_CENTRE_PX, SINGLE_FOCAL_SHARE
 
 _FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard deviations
-_OBSERVED = 0.5  # of the prior's standard deviation
-_MAX_HIDDEN_SHARE = 0.5  # of all parts; where more are hidden, no motion by itself is what lacks
+_OBSERVED = 0.5  # share of the rig file's standard deviation, below which a part is observed
+_MAX_HIDDEN_SHARE = 0.5  # of all parts; where more are hidden, it is not one kind of motion that is missing
 _TURN = "turn about two axes near textured surfaces"
 _DEPTHS = "walk past things at many distances, and let them move across the image"
 SCALE_MOTION = "accelerate: walk briskly with turns, or shake the rig"
-"""What shows lengths; a good rig file knows them better than most recordings do."""
+"""Motion that shows lengths; a good rig file knows them better than most recordings show them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +40,13 @@ class Finding:
 
     Attributes:
         part: what it is, such as ``pair front, rotation left to right``.
-        unit: of the difference.
-        difference: (N,) from the rig file.
-        sigmas: (N,) of it.
-        file_sigmas: (N,) of the rig file.
-        is_significant: whether the file is wrong in it beyond 5 sigma, and by more than what is left of effects that
-            the covariance does not have.
-        motion: which motion would show it.
+        unit: unit of the difference.
+        difference: (N,) difference from the rig file.
+        sigmas: (N,) standard deviations of the difference.
+        file_sigmas: (N,) standard deviations of the rig file.
+        is_significant: whether the file is wrong in this part beyond 5 sigma, after the variance of effects that the
+            covariance does not model is added.
+        motion: which motion would make it observable.
     """
 
     part: str
@@ -59,7 +59,7 @@ class Finding:
 
     @property
     def is_observed(self) -> bool:
-        """Whether the measurements said more of all of it than the rig file."""
+        """Whether the measurements have reduced all standard deviations to less than half of the rig file's."""
         return bool((self.sigmas < _OBSERVED * self.file_sigmas).all())
 
     @property
@@ -73,11 +73,11 @@ class Finding:
 
 
 def findings(estimate: CalibrationEstimate, file_covariance: Float) -> list[Finding]:
-    """Return all parts of a calibration.
+    """Compare all parts of a calibration with the rig file.
 
     Args:
-        estimate: of the calibration.
-        file_covariance: (C, C) of the rig file's values.
+        estimate: estimate of the calibration.
+        file_covariance: (C, C) covariance of the rig file's values.
     """
     covariance = estimate.posterior.covariance
     found = []
@@ -124,12 +124,12 @@ class _Part(NamedTuple):
     """A part of the calibration, as people name it.
 
     Attributes:
-        name: with that of the pair or camera.
-        unit: in which it is reported.
+        name: name of the part, with that of the pair or camera.
+        unit: unit in which it is reported.
         scale: factor to this unit.
         rows: (N, C) its parameters, as rows that a difference from the rig file is multiplied with.
-        floor: error in the unit that is added to its uncertainty: less is no fault of a file.
-        motion: that shows it.
+        floor: standard deviation in the unit that is added to its uncertainty: smaller errors are no fault of a file.
+        motion: motion that makes it observable.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""IMU readings as a calibrated IMU would measure them."""
+"""Correction of IMU readings to those of a calibrated IMU."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from graphvio.measurements.imu_interval import ImuInterval
 
 @dataclass(frozen=True, eq=False)
 class ImuCorrection:
-    """Matrices that readings of gyro and accelerometer are multiplied by.
+    """Corrects readings of gyro and accelerometer by matrices.
 
-    Biases are left to the state estimator, which must not see them jump when the matrices change. The accelerometer's
-    matrix therefore multiplies the difference from a fixed force, about that of gravity in body; what is left of its
-    effect stays a part of the bias.
+    Biases are left to the state estimator, for which they must not jump when the matrices change. The accelerometer's
+    matrix therefore multiplies the difference of a reading from a fixed force, about that of gravity in body; its
+    effect on the fixed force stays a part of the bias.
 
     Attributes:
         gyro: (3, 3) error of the gyro's matrix, ``I + gyro``.
-        accel: (3, 3) the same of the accelerometer.
-        fixed_force: (3,) m/s^2, body.
+        accel: (3, 3) error of the accelerometer's matrix, ``I + accel``.
+        fixed_force: (3,) specific force, m/s^2, frame body.
     """
 
     gyro: Float = field(default_factory=lambda: np.zeros((3, 3)))

@@ -1,11 +1,12 @@
-"""The IMU that is calibrated: its parameters, and calibrated readings at and between samples.
+"""Model of an IMU with errors of its calibration: its parameters, and calibrated readings at and between samples.
 
 Angular rate and specific force are ``Mg (gyro - bg)`` and ``Ma (accel - ba)`` with full matrices ``I + errors``, and a
 sample stamped t was taken at the cameras' time ``t - time_offset``. The parameters are a vector (25,): ``bg`` (3),
 ``ba`` (3), errors of ``Mg`` and of ``Ma`` (9 each, row by row), and the time offset in seconds.
 
-Between samples a reading is a cubic with the slopes of the parabolas through three samples (Catmull-Rom): straight
-lines cut off the peaks of a walk's steps, at 200 Hz by up to a sixth of what noise does in 0.25 s, always alike.
+Between samples a reading is a cubic with the slopes of the parabolas through three samples (Catmull-Rom). Linear
+interpolation cuts off the peaks of a walk's steps: at 200 Hz and over 0.25 s, its error is up to a sixth of that by
+noise, and it is systematic.
 """
 
 import numpy as np
@@ -31,9 +32,9 @@ def sensor_matrix(parameters: Float, at: int) -> Float:
 
 @kernel
 def slope_at(stamps_ns: Int, readings: Float, i: int, slope: Float) -> None:
-    """Fill the slope (6,) at a sample: of the parabola through its neighbours and it, or of a line at the ends.
+    """Fill the slope (6,) at a sample: of the parabola through it and its neighbours, or of a line at the ends.
 
-    Beside a gap it is about that of the nearer neighbour.
+    Next to a gap it is close to the slope towards the nearer neighbour.
     """
     before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
     if before == i or after == i:

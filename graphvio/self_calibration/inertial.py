@@ -20,7 +20,7 @@ from graphvio.self_calibration.preintegration import Preintegrated, covering_sam
 POSE, VELOCITY, GRAVITY = 6, 3, 3
 _VELOCITY_I, _POSE_J, _VELOCITY_J, _GRAVITY_AT, _PARAMETERS_AT = 6, 9, 15, 18, 21
 _COLUMNS = _PARAMETERS_AT + PARAMETERS
-_MAX_NOISE2 = 28.0  # of a squared whitened error: noise exceeds it once in a thousand intervals
+_MAX_NOISE2 = 28.0  # largest squared whitened error by noise, which exceeds it once in a thousand intervals
 _MAX_SPIKE = np.repeat([2.0, 20.0], 3)  # rad/s and m/s^2, of one sample against both neighbours
 
 
@@ -32,8 +32,9 @@ class InertialSamples(NamedTuple):
         readings: (N, 6) gyro, rad/s, and accelerometer, m/s^2, frame body.
         keyframes_ns: (K,) stamps of the keyframes, of the cameras' clock.
         noise_densities: (2,) white noise of gyro, rad/s/sqrt(Hz), and of accelerometer, m/s^2/sqrt(Hz).
-        max_gap_ns: between samples of one interval.
-        noise_factors: (N, 2) by which the noise's variance is larger from each sample to the next.
+        max_gap_ns: largest gap between samples of one interval.
+        noise_factors: (N, 2) factors on the variance of the noise of gyro and accelerometer, from each sample to the
+            next.
     """
 
     stamps_ns: Int
@@ -104,11 +105,11 @@ def inertial_residual(
         nav_T_j: (4, 4) at the end.
         velocity_j: (3,).
         gravity: (3,) m/s^2, frame nav, downwards.
-        preintegrated: the IMU, by the parameters at which to linearise.
+        preintegrated: the preintegrated IMU, for the parameters at which to linearise.
 
     Returns:
-        Error (9,) ``[rotation, velocity, position]``, whose covariance is the preintegrated one, and its derivative
-        (9, 46) with respect to ``[pose i 6, velocity i 3, pose j 6, velocity j 3, gravity 3, parameters 25]``.
+        Error (9,) ``[rotation, velocity, position]``, whose covariance is the preintegrated one, and its derivative (9,
+        46) with respect to ``[pose i 6, velocity i 3, pose j 6, velocity j 3, gravity 3, parameters 25]``.
     """
     dt = preintegrated.duration_s
     i_R_nav = nav_T_i[:3, :3].T.copy()
@@ -224,18 +225,18 @@ def inertial_equations(samples: InertialSamples, states: InertialStates) -> Iner
 def _take_noise(
     preintegrated: Preintegrated, parameters: Float, whitener: Float, whitened: Float, error2: float, jacobian: Float
 ) -> None:
-    """Take the noise that an error shows out of its derivatives with respect to the accelerometer's matrix.
+    """Remove the noise that an error shows from its derivatives with respect to the accelerometer's matrix.
 
-    The derivatives are proportional to readings that have the noise of the error: errors in variables, by which a scale
-    that vision does not know either shrinks, by a percent in minutes. Without that noise, the gradient is that of the
-    squared error, whose covariance grows with the matrix. W. A. Fuller, *Measurement Error Models*, Wiley 1987,
-    section 1.1. The gyro's noise is so small beside what it measures that its matrix needs none of this.
+    The derivatives are proportional to readings, whose noise is also in the error (errors in variables): by this, a
+    scale that vision does not observe either would shrink by a percent in minutes. Without that noise, the gradient is
+    that of the squared error, whose covariance grows with the matrix. W. A. Fuller, *Measurement Error Models*, Wiley
+    1987, section 1.1. The gyro's noise is so small beside what it measures that its matrix needs none of this.
 
     Args:
-        preintegrated: the IMU.
-        parameters: (25,) of it.
-        whitener: (9, 9) of the error.
-        whitened: (9,) error.
+        preintegrated: the preintegrated IMU.
+        parameters: (25,) of the IMU.
+        whitener: (9, 9) matrix that whitens the error.
+        whitened: (9,) whitened error.
         error2: its square.
         jacobian: (9, 46) is changed.
     """
@@ -260,7 +261,7 @@ def _take_noise(
 
 @kernel
 def _put_columns(n_keyframes: int, i: int, columns: Int) -> None:
-    """Fill where the columns (46,) of `inertial_residual` are in the window's equations."""
+    """Fill the indices (46,) of the columns of `inertial_residual` in the window's equations."""
     for c in range(POSE):
         columns[c], columns[_POSE_J + c] = POSE * i + c, POSE * (i + 1) + c
     for c in range(VELOCITY):

@@ -20,15 +20,15 @@ from graphvio.self_calibration.solver import Solution
 
 
 def newest_inertial_state(stamp_ns: int, solution: Solution) -> InertialState:
-    """Return what a window's adjustment says of its newest keyframe.
+    """Return velocity, biases and gravity at a window's newest keyframe, from the window's adjustment.
 
     Args:
-        stamp_ns: of the keyframe.
-        solution: of the window, with an IMU.
+        stamp_ns: stamp of the keyframe.
+        solution: solution of the window, with an IMU.
 
     Returns:
-        The state. Its biases are those of readings whose matrices have no errors: what these errors do at a rate of
-        zero and at the force of gravity is a part of the biases.
+        The state. Its biases are those of an IMU without errors of its matrices: the effect of these errors at a rate
+        of zero and at the force of gravity is a part of the biases.
 
     Raises:
         numpy.linalg.LinAlgError: if its covariance is not positive definite.

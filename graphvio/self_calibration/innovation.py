@@ -1,4 +1,4 @@
-"""What errors of the calibration add to the innovation of a motion: vision and the IMU disagree by it."""
+"""What errors of the calibration add to the covariance of a motion's innovation, vision against the IMU."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _ERROR_SHARE = 0.2  # isotropic share added, since depth errors away from the im
 
 
 class InnovationErrors:
-    """Errors of cameras and their extrinsics, of the gyro's matrix and of the time offset, in a motion's innovation.
+    """Effect of errors of cameras, extrinsics, gyro matrix and time offset on the innovation of a motion.
 
     The innovation is the motion of body by vision less that by the IMU. To a motion M of body, an error d of the
-    cameras' extrinsics adds ``(Ad(M^-1) - I) d``, an error D of the gyro's matrix the rotation ``D phi`` with M's
-    rotation vector phi, and an error of the time offset the motion that body makes in it at the end, less that at the
-    beginning. Errors within a pair add what wrong depths do, see `graphvio.frontend.motion.depth_errors`. All are taken
-    as independent.
+    cameras' extrinsics adds ``(Ad(M^-1) - I) d``, and an error D of the gyro's matrix adds the rotation ``D phi`` with
+    M's rotation vector phi. An error of the time offset adds the motion of body within that time at the end, less that
+    at the beginning. Errors within a pair act by wrong depths, see `graphvio.frontend.motion.depth_errors`. All are
+    taken as independent.
 
     Args:
-        covariance: (C, C) of the calibration of the cameras and the IMU.
-        rig: That it belongs to.
+        covariance: (C, C) covariance of the calibration of the cameras and the IMU.
+        rig: Rig that it belongs to.
     """
 
     def __init__(self, covariance: Float, rig: Rig) -> None:
@@ -39,10 +39,10 @@ class InnovationErrors:
         self._of_time_offset = float(imu[TIME_OFFSET, TIME_OFFSET])
 
     def covariance(self, motion: Float, before: Float | None, now: Float | None) -> Float:
-        """Return the covariance that they add.
+        """Return the covariance that errors of the extrinsics, the gyro's matrix and the time offset add.
 
         Args:
-            motion: (4, 4) of body, ``reference_T_current``.
+            motion: (4, 4) motion of body, ``reference_T_current``.
             before: (6,) angular and linear velocity of body, in its own frame, rad/s and m/s, at the beginning; None
                 leaves out the time offset.
             now: the same at the end.
@@ -64,7 +64,7 @@ class InnovationErrors:
         """Return the covariance that errors within the pairs add.
 
         Args:
-            derivatives: (P, 2, 6) of the innovation, see `graphvio.measurements.motion.RelativeMotion`.
+            derivatives: (P, 2, 6) derivatives of the innovation, see `graphvio.measurements.motion.RelativeMotion`.
 
         Returns:
             (6, 6), tangent as that of the derivatives.

@@ -1,4 +1,4 @@
-"""A knock that turns a camera: matches that all leave their epipolar lines at once."""
+"""Detection of a knock that turns a camera, by matches that all leave their epipolar lines at once."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from graphvio.self_calibration.window import View
 
 _MIN_MATCHES = 30
 _MAX_OFFSET_PX = 0.25  # median; a calibration that is well known is off by a tenth of it
-_MAX_SIGMAS = 4.0  # of the offset by what is known of the calibration: elsewhere in an image it may be known less well
+_MAX_SIGMAS = 4.0  # of the offset, by the calibration's covariance: elsewhere in an image it may be known less well
 _CONFIRMED = 3  # keyframes, one after the other
 _MAX_CHANGE = 0.2  # relative, between these keyframes: a turned camera's offset stays, a late camera's does not
-_TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # what a knock may do to a camera and to a pair
+_TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # standard deviations of what a knock does to a camera or a pair
 
 
 class KnockDetector:
-    """Watches how far matches are off their epipolar lines, which no scene changes, whether it moves or not."""
+    """Monitors how far matches are off their epipolar lines, which does not depend on the scene or on its motion."""
 
     def __init__(self) -> None:
         self._off_px: dict[int, list[float]] = {}  # pair index -> offsets at its newest keyframes, one after the other
 
     def update(self, views: Mapping[int, View], calibration: RigCalibration, covariance: Float) -> list[int]:
-        """Add a keyframe's views.
+        """Add a keyframe's views, and return the pairs that have been knocked.
 
         Args:
             views: index of the pair or single camera -> tracks.
-            calibration: that is in force.
-            covariance: (C, C) of the cameras' parameters, by which these are known.
+            calibration: calibration that is in force.
+            covariance: (C, C) covariance of the cameras' parameters.
 
         Returns:
             Indices of the pairs whose offset has lasted for three of their keyframes: they are not where they were.
@@ -54,7 +54,7 @@ class KnockDetector:
 
 
 def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float | None:
-    """Return how far a pair's matches are beside their epipolar lines in the median, None where there are few."""
+    """Return the median signed distance of a pair's matches from their epipolar lines, None where there are few."""
     return None if view.has_right.sum() < _MIN_MATCHES else _offset_px(view, calibration, pair)
 
 
@@ -89,7 +89,7 @@ def _offset_sigma_px(view: View, calibration: RigCalibration, pair: int, covaria
 
 
 def knock_covariance(rig: Rig, n_parameters: int, groups: Iterable[int]) -> Float:
-    """Return the covariance (C, C) of what a knock does to some pairs and single cameras.
+    """Return the covariance (C, C) of the change that a knock makes to some pairs and single cameras.
 
     It turns and shifts cameras; lenses, the IMU and the length of a baseline stay.
     """

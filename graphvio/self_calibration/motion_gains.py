@@ -1,7 +1,7 @@
 """How the newest pose depends on the cameras' calibration since an earlier keyframe.
 
-`ConsiderCovariance` knows it up to the keyframe that was adjusted last. Keyframes come with the motion, and adjustments
-some framesets after them: a rig that begins to walk is half a metre away by then.
+`ConsiderCovariance` knows this up to the keyframe that was adjusted last. Keyframes are only made in motion, and are
+adjusted some framesets later: a rig that begins to walk is half a metre away by then.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Rig
 from graphvio.self_calibration.parameters import about_origin, depths_of_pair, extrinsics_of, n_camera_parameters
 
-_MAX_KEYFRAMES = 64  # that wait for an adjustment
+_MAX_KEYFRAMES = 64  # largest number of keyframes that wait for an adjustment
 
 
 class PoseGain(NamedTuple):
@@ -36,15 +36,15 @@ class PoseGain(NamedTuple):
 @dataclass
 class _Frameset:
     instant_ns: int
-    pose: PoseGain  # by errors of depths, since the first frameset
+    pose: PoseGain  # by errors of depths only, since the first frameset
     is_keyframe: bool = False
 
 
 class MotionGains:
-    """Sums the effect of wrong depths on each motion by vision, from the frameset that the motion is measured from.
+    """Sums the effect of wrong depths on the motions by vision, each from the frameset that it is measured from.
 
     Args:
-        rig: With the cameras of the calibration.
+        rig: Rig with the cameras of the calibration.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -54,7 +54,7 @@ class MotionGains:
         self._framesets: dict[int, _Frameset] = {}  # by stamp, in time order
 
     def restart(self) -> None:
-        """Forget all framesets: the poses that come are in another frame."""
+        """Forget all framesets: later poses are in another frame."""
         self._framesets = {}
 
     def add(
@@ -69,10 +69,10 @@ class MotionGains:
         """Add a frameset, and forget those that nothing is measured from any more.
 
         Args:
-            stamp_ns: Of it.
-            instant_ns: Of its images, which is a keyframe's stamp.
+            stamp_ns: Stamp of the frameset.
+            instant_ns: Instant of its images, by which keyframes are stamped.
             odom_T_body: (4, 4) its pose.
-            motion: By vision, which the pose follows, or None.
+            motion: Motion by vision that the pose follows, or None.
             references: Stamps of the framesets that later motions are measured from.
             since_ns: Instant of the keyframe that was adjusted last, or None. While no adjustment comes into force, it
                 may be long ago.

@@ -1,9 +1,9 @@
 """Landmarks that move along with the camera that sees them first, while a window is adjusted.
 
-A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own. With the camera that sees it
-first as this frame, and steps of its direction and distance there, all distances and baselines may become larger by the
-same factor, and no view changes: for a landmark that stays in a fixed frame, views are off by the square of the step,
-and the scale is found in steps of a few percent.
+A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a frame of its own. If this frame is that of the
+camera that sees it first, and steps change its direction and distance there, all distances and baselines can grow by
+the same factor without a change of any view. If the frame were fixed, such a step would change the views by the square
+of its size, and the scale could be found in steps of a few percent only.
 """
 
 from graphvio.arrays import Float
@@ -11,7 +11,7 @@ from graphvio.geometry import se3_compose
 from graphvio.kernels import kernel, put
 from graphvio.self_calibration.observation import MIN_DEPTH_RATIO
 
-_MAX_NEARER = 0.5  # step of an inverse depth, relative, that is taken as one of the depth
+_MAX_NEARER = 0.5  # largest relative step to a larger inverse depth that is taken as a step of the depth
 
 
 @kernel
@@ -22,16 +22,16 @@ def move_landmark(
     """Fill in a landmark (3,) after a step, and its frame: the camera's, or as it was where it is behind the camera.
 
     Args:
-        frame: (4, 4) of the landmark in odom; output too.
+        frame: (4, 4) frame of the landmark in odom; also output.
         landmark: (3,) before.
-        inverse: (3, 3) of its normal matrix.
-        gradient: (3,) of the cost with respect to it, after the step of the others.
+        inverse: (3, 3) inverse of its normal matrix.
+        gradient: (3,) gradient of the cost with respect to it, after the step of the other unknowns.
         pose: (4, 4) ``odom_T_body`` before, of the state that sees it first.
         moved_pose: (4, 4) after.
-        body_T_cam: (4, 4) of the camera that sees it first.
+        body_T_cam: (4, 4) pose of the camera that sees it first.
         step: (6,) of the pose.
-        max_farther: step to a smaller inverse depth, relative, up to which it is taken as one of the depth: with steps
-            of the depth any change of the scale is found, and with others points are found that are nearly infinite.
+        max_farther: largest relative step to a smaller inverse depth that is taken as a step of the depth. Steps of the
+            depth allow any change of the scale; steps of the inverse depth reach points that are nearly at infinity.
         work: (4, 3) for intermediate results.
         moved: (3,) output.
     """
@@ -55,13 +55,13 @@ def _moved_with_camera(
     """Fill in the landmark (3,), in the frame of the camera, after its own step (3,) and that of the body (6,).
 
     Args:
-        frame: (4, 4) of the landmark in odom.
+        frame: (4, 4) frame of the landmark in odom.
         landmark: (3,) before.
-        by: (3,) its step in that frame, which stays.
+        by: (3,) its own step, in its frame before.
         pose: (4, 4) ``odom_T_body`` before.
         body_T_cam: (4, 4).
         step: (6,) of the pose.
-        max_farther: as `move_landmark`.
+        max_farther: as in `move_landmark`.
         work: (4, 3) for intermediate results, of which three rows are used.
         moved: (3,) output.
 
@@ -69,7 +69,7 @@ def _moved_with_camera(
         Whether the landmark is in front of the camera.
     """
     odom, body, cam, w = work[0], work[1], work[2], landmark[2]
-    # Where it is: homogeneous, in body and in the camera.
+    # The landmark in body and in the camera, homogeneous.
     for r in range(3):
         odom[r] = frame[r, 0] * landmark[0] + frame[r, 1] * landmark[1] + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
     for r in range(3):
@@ -82,7 +82,7 @@ def _moved_with_camera(
     if not cam[2] > MIN_DEPTH_RATIO:
         return False
     at_x, at_y, depth, at_w = cam[0] / cam[2], cam[1] / cam[2], cam[2], w / cam[2]
-    # How that changes, in first order: by its own step, and as the body turns and shifts.
+    # Its change to first order: by its own step, and by the rotation and translation of the body.
     for r in range(3):
         odom[r] = frame[r, 0] * by[0] + frame[r, 1] * by[1] + by[2] * (frame[r, 3] - pose[r, 3])
     for r in range(3):

@@ -30,7 +30,7 @@ MIN_DEPTH_RATIO = 1e-3
 
 
 class Scratch(NamedTuple):
-    """Intermediate results of `observe`, which would be allocated for each observation."""
+    """Intermediate results of `observe`, which would otherwise be allocated for each observation."""
 
     of_point: tuple[Float, Float, Float, Float, Float, Float]
     of_pixel: tuple[Float, Float, Float, Float, Float]
@@ -52,7 +52,11 @@ def _project(
     calibration: RigCalibration, j: int, image: int, y: Float, seen: Float, to_pixel: Float, error: Float,
     by_camera: Float,
 ) -> bool:  # fmt: skip
-    """Project a homogeneous point (3,): error (2,), derivatives with respect to point (2, 3) and camera (2, 9)."""
+    """Project a homogeneous point (3,); fill the error (2,) and its derivatives by point (2, 3) and camera (2, 9).
+
+    Returns:
+        Whether the point is in front of the camera, and within the domain of its lens.
+    """
     if not y[2] > MIN_DEPTH_RATIO:
         return False
     model, intrinsics, distortion = (
@@ -93,7 +97,8 @@ def observe(
 ) -> int:  # fmt: skip
     """Fill rows (4, COLUMNS) of one observation: derivatives with respect to pose, calibration and landmark, errors.
 
-    Loops stand for slices throughout: each slice that is assigned takes seconds to compile, in every kernel that calls.
+    Loops are used instead of slices throughout: each slice that is assigned takes seconds to compile, in every kernel
+    that calls this one.
 
     Returns:
         The number of rows that were filled: 0, 2 or 4, pixels of the left image first.

@@ -1,8 +1,8 @@
 """Self-calibration while the odometry runs: keyframes and IMU samples in, calibrations out.
 
 Keyframes are collected in windows. Each window is adjusted several times while it grows, in a thread of its own; once
-it is full, what it says of the calibration is kept, and the next window begins. Windows share no observation. A result
-comes into force a fixed number of framesets after its adjustment began, so that a run does not depend on timing.
+it is full, its evidence about the calibration is kept, and the next window begins. Windows share no observation. A
+result comes into force a fixed number of framesets after its adjustment began, so that a run does not depend on timing.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from graphvio.self_calibration.window import View
 from graphvio.self_calibration.window_adjustment import AdjustedWindow, WindowAdjustment
 
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
-_MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
-_MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
+_MAX_SIGMAS = 4.0  # of a parameter, in the file's standard deviations times the largest factor
+_MIN_AGREEING = 3  # keyframes whose pairs agreed: later contradictions are attributed to the scene
 _MAX_REFUSED = 3  # full windows
 _MIN_CONFIRMING = 2  # full windows; one is at times off by more than its covariance says
-WALK = 0.01  # in one second, as a share of the prior's standard deviations
-_MAX_WALK_S = 10.0  # in a window
+WALK = 0.01  # random walk in one second, as a share of the prior's standard deviations
+_MAX_WALK_S = 10.0  # longest duration of the random walk over one window
 
 
 class _Pace(NamedTuple):
@@ -55,25 +55,27 @@ _PACES = (
     _Pace((5, 10, WINDOW), 0.15, 4),
     _Pace((8, WINDOW), 0.25, 8),
 )
-"""Of the first windows; the last one is that of all later ones."""
+"""Paces of the first windows; the last one is also that of all later windows."""
 
 
 class SelfCalibration:
     """Estimates how the calibration of a rig differs from its rig file.
 
     Args:
-        rig: from the rig file, with how far its calibration is known.
+        rig: rig of the rig file, with the standard deviations of its calibration.
 
     Attributes:
-        estimate: what is known now.
+        estimate: current estimate of the calibration.
         extrinsics: index of a pair or single camera -> covariance (6, 6) of its pose relative to the first pair, see
-            `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
-            file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
+            `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. It is
+            computed for the largest errors that a file may have: a few windows may show that it is wrong long before
+            they show how wrong.
         upper_covariance: (C, C) covariance of the calibration if the rig file's standard deviations are all scaled by
             `MAX_FACTOR`; used by the innovation test.
-        inertial_state: at the newest keyframe that the calibration in force is based on, or None without an IMU, or
-            while the rig file is as good as exact.
-        restarts: how often what was known has been forgotten, since later windows contradicted it.
+        inertial_state: velocity, biases and gravity at the newest keyframe that the calibration in force is based on,
+            or None without an IMU, or while the rig file is as good as exact.
+        restarts: how often estimated extrinsics have been forgotten, after a knock or since later windows contradicted
+            them.
         on_full_window: called with each window that is full, before it is adjusted.
     """
 
@@ -84,7 +86,7 @@ class SelfCalibration:
         upper_covariance = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
         self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(upper_covariance)))
         self._walk = walk_per_second(rig, self._prior, WALK)
-        self._evidence = Evidence.none(len(self._walk))  # of the full windows
+        self._evidence = Evidence.none(len(self._walk))  # evidence of the full windows
         n_groups = self._prior.n_groups
         posterior = self._evidence.given(self._prior, np.ones(n_groups))
         at_first = self._prior.smallest_factors
@@ -97,17 +99,17 @@ class SelfCalibration:
         self._in_force = self._nominal
         self._in_force_covariance = self._prior.covariance[: self._n_camera_parameters, : self._n_camera_parameters]
         self._knocks = KnockDetector()
-        self._agreeing = 0  # keyframes
+        self._agreeing = 0  # keyframes whose pairs agreed
         self._refused = 0  # full windows, one after the other
-        self._implausible: list[Gaussian] = []  # calibrations by the same, by which the file is more wrong than any
-        self._are_cameras_beyond_any = False  # in the file, as two full windows agree
+        self._implausible: list[Gaussian] = []  # calibrations of full windows by which the file is implausibly wrong
+        self._are_cameras_beyond_any = False  # whether two full windows agree that the file's cameras are so wrong
         self._sigma_px = FIRST_WINDOW_SIGMA_PX
         self._collector = WindowCollector(rig)
         self._full_windows = 0
-        self._used_windows = 0  # full ones, without those that are left out
-        self._adjusted_at = 0  # keyframes of this window
+        self._used_windows = 0  # full windows that were not left out
+        self._adjusted_at = 0  # number of this window's keyframes at its last adjustment
         self._pending: Future[AdjustedWindow | None] | None = None
-        self._due_in = 0  # framesets
+        self._due_in = 0  # framesets until a result comes into force
         self._consider = ConsiderCovariance(self._n_camera_parameters)
         self._gains = MotionGains(rig)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="graphvio-calibration")
@@ -121,11 +123,11 @@ class SelfCalibration:
         return findings(self.estimate, self._prior.covariance)
 
     def add_sample(self, sample: ImuSample) -> None:
-        """Take an IMU sample as it was measured, in time order."""
+        """Add an IMU sample as it was measured, in time order."""
         self._collector.add_sample(sample)
 
     def note_stamps(self, sigma_s: float) -> None:
-        """Take the standard deviation of the framesets' stamps, seconds, as it is known now."""
+        """Set the current estimate of the standard deviation of the framesets' stamps, seconds."""
         self._collector.stamp_sigma_s = sigma_s
 
     def add_motion(
@@ -142,16 +144,16 @@ class SelfCalibration:
         are_contradicting: bool = False,
         is_urgent: bool = False,
     ) -> None:
-        """Take what the pairs see at a frameset.
+        """Add the views of a frameset, which becomes a keyframe if the images have moved.
 
         Args:
-            stamp_ns: of the frameset.
+            stamp_ns: stamp of the frameset.
             odom_T_body: (4, 4) its estimated pose.
             views: index of the pair or single camera -> tracks.
-            are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
-                did, and the scene if they once agreed.
+            are_contradicting: whether the pairs' motions contradict each other. If they always did, this is attributed
+                to the calibration; if they once agreed, to the scene.
             is_urgent: whether motions cannot be measured with the calibration in force: an adjustment that is due comes
-                into force with this frameset then. Its left and right images alone show how epipolar lines are off.
+                into force with this frameset then. Its left and right images alone show how far epipolar lines are off.
         """
         self._adjust_when_due()
         if not self._collector.is_keyframe(stamp_ns, views, self._pace.interval_s):
@@ -173,16 +175,16 @@ class SelfCalibration:
         return self._consider.at(odom_T_body, self._since_newest())
 
     def correct_pose(self, turned: Float) -> None:
-        """Take note that the newest pose has been changed by a tangent (6,) in body, as the calibration asked for."""
+        """Record that the newest pose has been changed by a tangent (6,) in body, since the calibration has changed."""
         self._consider.correct(turned)
 
     def start_window(self) -> None:
-        """Discard the window that is not full: the poses that come are in another frame."""
+        """Discard the unfinished window: later poses are in another frame."""
         self._gains.restart()
         self._discard_window()
 
     def restart_imu(self) -> None:
-        """Discard all that has IMU samples of before: those that come are of another clock."""
+        """Discard everything that has earlier IMU samples: later ones are of another clock."""
         self._pending = None
         self._discard_window()
         self._collector.forget_samples()
@@ -207,7 +209,7 @@ class SelfCalibration:
 
     @property
     def is_trusted(self) -> bool:
-        """Whether pairs that contradict each other are the scene's fault, and no longer the calibration's."""
+        """Whether contradictions of pairs are attributed to the scene, and no longer to the calibration."""
         if self.has_full_window:
             return True
         return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
@@ -219,7 +221,7 @@ class SelfCalibration:
 
     @property
     def implausible_parameter(self) -> str | None:
-        """Name of the parameter that is farthest off where windows say that the rig file is more wrong than any.
+        """Name of the parameter that is farthest off, where windows find the rig file more wrong than any file may be.
 
         None while there is but one such window, and once two have agreed, as the calibration is corrected then.
         """
@@ -231,12 +233,12 @@ class SelfCalibration:
 
     @property
     def has_full_window(self) -> bool:
-        """Whether what is known is based on a full window at least."""
+        """Whether the estimate is based on at least one full window."""
         return self._used_windows > 0
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether what is known comes from two full windows at least, which share no observation."""
+        """Whether the estimate is based on at least two full windows, which share no observation."""
         return self._used_windows >= _MIN_CONFIRMING
 
     @property
@@ -251,15 +253,15 @@ class SelfCalibration:
             return False
         if not self._is_plausible(calibration, adjusted.is_full):
             return False
-        # What a full window has confirmed, a part of one does not refute: it may be the scene's fault.
+        # An unfinished window does not refute what a full one has confirmed: the scene may be at fault.
         is_confirmed = self.has_full_window and self.estimate.is_file_exact
         return adjusted.is_full or adjusted.estimate.is_file_exact or not is_confirmed
 
     def _is_plausible(self, calibration: Gaussian, is_full: bool) -> bool:
         """Return whether the rig file can be as wrong as a window says.
 
-        Where it is more wrong than any file, the window is at fault, unless the full one before says the same of the
-        cameras. An IMU that is so wrong is none to be calibrated.
+        If that is more than any file may be, the window is at fault, unless the full one before says the same of the
+        cameras. An IMU that is so wrong is not calibrated.
         """
         if not np.isfinite(calibration.mean).all():
             return False
@@ -278,7 +280,7 @@ class SelfCalibration:
         return False
 
     def _put_in_force(self, adjusted: AdjustedWindow) -> None:
-        """Use an adjustment's result from now on, and its noise for the next windows."""
+        """Use an adjustment's result from now on, and its pixel noise for the next windows."""
         if adjusted.is_full:
             self._evidence, self._refused, self._implausible = adjusted.evidence, 0, []
             self._used_windows += 1
@@ -306,19 +308,22 @@ class SelfCalibration:
         return None if newest_ns is None else self._gains.since(newest_ns)
 
     def _knocked(self, views: Mapping[int, View]) -> list[int]:
-        """Return the pairs that have been knocked, by what a keyframe adds; none while too little is known of them."""
+        """Return the pairs that have been knocked, by a keyframe's views; none while the calibration is unconfirmed."""
         if not (self.is_confirmed or self.estimate.is_file_exact):
             return []
         return self._knocks.update(views, self._in_force, self._in_force_covariance)
 
     def _refuse(self, is_full: bool) -> None:
-        """Discard a window that contradicts those before it; several such windows are a knock."""
+        """Discard a window that contradicts those before it; three full ones in succession are taken as a knock."""
         self._refused += is_full
         if self._refused >= _MAX_REFUSED:
             self._forget_extrinsics(range(len(self._rig.groups)))
 
     def _forget_extrinsics(self, groups: Iterable[int]) -> None:
-        """Begin again after a knock of some pairs or cameras, with what was known of the others, of lenses and IMU."""
+        """Estimate extrinsics again after a knock of some pairs or cameras.
+
+        What is known of the others, of lenses and of the IMU is kept.
+        """
         self._pending = None
         change = knock_covariance(self._rig, len(self._walk), groups)
         self._evidence, self._prior = self._evidence.after_random_walk(change), self._prior.changed(change)
@@ -332,7 +337,7 @@ class SelfCalibration:
     def _adjust_when_due(self) -> None:
         """Begin to adjust the window as it is now, if it has grown enough; a full one is followed by a new one.
 
-        It is done when the frameset after the last keyframe has come: by then the IMU covers the last keyframe,
+        This is done once the frameset after the last keyframe has come: by then the IMU covers the last keyframe,
         whatever its time offset.
         """
         if self._pending is not None:
@@ -366,6 +371,6 @@ class SelfCalibration:
 
 
 def _when_compiled(adjustment: WindowAdjustment) -> AdjustedWindow | None:
-    """Adjust a window as soon as another process has compiled what that needs."""
+    """Adjust a window as soon as another process has compiled the kernels for that."""
     await_compilers()
     return adjustment.result()

@@ -1,10 +1,11 @@
 """Calibration of a rig as one vector of parameters: its layout, and rigs that differ by such a vector.
 
-Of a lens, the first five coefficients have a place in it; the others, of ``rational``'s denominator, are kept.
+A vector is the difference from the nominal rig, that of the rig file. Parameters of pairs come first, those of single
+cameras follow. Rotations are rotation vectors: that of the right camera turns the left camera's frame, ``right_R_left
+Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
 
-A vector is the difference from the nominal rig, that of the rig file. Rotations are rotation vectors: that of the right
-camera turns the left camera's frame, ``right_R_left Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
-Those of pairs come first, those of single cameras follow.
+Of a lens, the first five distortion coefficients are in the vector; the others, of ``rational``'s denominator, stay
+those of the rig file.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ LEFT, RIGHT, STEREO, BODY = 0, CAMERA, 2 * CAMERA, 2 * CAMERA + 6
 PAIR = BODY + 6
 """Number of parameters of a pair: left camera, right camera, ``right_T_left``, ``body_T_left``."""
 PLACE, SINGLE = CAMERA, CAMERA + 6
-"""Where those of ``body_T_cam`` of a single camera begin, after the lens, and how many there are in all."""
+"""Index of a single camera's first parameter of ``body_T_cam``, after its lens, and number of all its parameters."""
 
 
 _CAMERA_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "d1", "d2", "d3", "d4", "d5")
@@ -56,14 +57,14 @@ def n_camera_parameters(rig: Rig) -> int:
 
 
 def slices_of_groups(rig: Rig) -> list[slice]:
-    """Return where the parameters of each pair and single camera are."""
+    """Return the slice of the parameters of each pair and single camera."""
     sizes = [PAIR] * len(rig.pairs) + [SINGLE] * len(rig.singles)
     ends = np.cumsum(sizes).tolist()
     return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
 
 
 def extrinsics_of(rig: Rig, j: int) -> slice:
-    """Return where the parameters (6,) of the extrinsics of a pair's left camera, or of a single one, are."""
+    """Return the slice of the parameters (6,) of the extrinsics of a pair's left camera, or of a single camera."""
     end = slices_of_groups(rig)[j].stop
     return slice(end - 6, end)
 
@@ -79,7 +80,7 @@ def has_coefficient(camera: Camera) -> Bool:
 
 
 def about_origin(rig: Rig, j: int) -> Float:
-    """Return derivatives (6, 6) of d with respect to parameters of extrinsics, which are ``exp(d) body_T_left``."""
+    """Return the derivatives (6, 6) of d with respect to the parameters of extrinsics, for ``exp(d) body_T_left``."""
     rows = np.eye(6)
     rows[3:, :3] = skew(rig.groups[j].left.body_T_cam[:3, 3])
     return rows
@@ -107,9 +108,9 @@ def depths_of_pair(rig: Rig, j: int) -> Float:
 
 
 def relative_to_first(rig: Rig, j: int) -> Float:
-    """Return the derivatives (6, `n_camera_parameters`) of a group's pose in body, seen from group 0.
+    """Return the derivatives (6, `n_camera_parameters`) of a group's pose in body relative to that of group 0.
 
-    Where body turns or moves against all cameras, their extrinsics change, and none of these differences does.
+    If body turns or moves against all cameras, their extrinsics change, but none of these differences does.
     """
     rows = np.zeros((6, n_camera_parameters(rig)))
     first, own = rows[:, extrinsics_of(rig, 0)], rows[:, extrinsics_of(rig, j)]
@@ -120,7 +121,7 @@ def relative_to_first(rig: Rig, j: int) -> Float:
 
 
 class RigCalibration(NamedTuple):
-    """Calibration of G pairs and single cameras, as kernels take it.
+    """Calibration of G pairs and single cameras, as arrays for kernels.
 
     Index 0 of two is the left camera, 1 the right one; a single camera takes the place of both.
 
@@ -130,7 +131,7 @@ class RigCalibration(NamedTuple):
         distortion: (G, 2, 8).
         right_T_left: (G, 4, 4).
         body_T_left: (G, 4, 4).
-        is_single: (G,).
+        is_single: (G,) whether it is a single camera.
     """
 
     models: Int
@@ -155,7 +156,7 @@ class RigCalibration(NamedTuple):
 
     @property
     def columns(self) -> Int:
-        """Where the parameters (C,) are among (G * PAIR,), where single cameras have as many as pairs."""
+        """Indices of the parameters (C,) in a vector (G * PAIR,) where single cameras have as many as pairs."""
         of_pair, of_single = np.arange(PAIR), np.r_[LEFT:CAMERA, BODY:PAIR]
         return np.concatenate(
             [j * PAIR + (of_single if is_single else of_pair) for j, is_single in enumerate(self.is_single)]

@@ -1,4 +1,4 @@
-"""Noise of corners' positions, as the residuals of an adjustment show it."""
+"""Noise of corners' positions, estimated from the residuals of an adjustment."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from graphvio.self_calibration.bundle import Tracks
 
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
-_RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_OBSERVATIONS = 10  # of a view, before its noise is judged
+_RAYLEIGH_MEDIAN = 1.1774  # median of the norm of two standard normal variables
+_MIN_OBSERVATIONS = 10  # least number of a view's observations to estimate its noise
 _MIN_EXCESS = 1.5  # ratio of the noise that a view shows to the one that was assumed
 
 
@@ -27,11 +27,11 @@ def pixel_noise(errors2: Float, sigma_px: float | Float) -> float:
 def noise_of_views(tracks: Tracks, errors2: Float) -> Float:
     """Return the noise (N,) of each observation, px.
 
-    A view, what one pair or camera sees at one keyframe, whose residuals show clearly more noise than was assumed gets
-    its own: over-exposed and blurred images lie among sharp ones.
+    A view is what one pair or camera sees at one keyframe. If its residuals show clearly more noise than was assumed,
+    it gets its own: over-exposed and blurred images lie among sharp ones.
 
     Args:
-        tracks: with the noise that was assumed.
+        tracks: tracks, with the noise that was assumed.
         errors2: (N, 2) squared errors, whitened by it; NaN where there is no right image.
     """
     noise_px, pair = tracks.sigma_px.copy(), np.repeat(tracks.pair, np.diff(tracks.rows))

@@ -1,7 +1,7 @@
-"""The IMU between two instants as one change of rotation, velocity and position.
+"""Preintegration of the IMU between two instants: one change of rotation, velocity and position.
 
-Values are integrated to fourth order in the step (Simpson's rule; rotations with the term of coning): C. Forster,
-L. Carlone, F. Dellaert, D. Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial Odometry*, IEEE T-RO
+Readings are integrated to fourth order in the step (Simpson's rule; rotations with the coning term): C. Forster, L.
+Carlone, F. Dellaert, D. Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial Odometry*, IEEE T-RO
 33(1), 2017, with derivatives with respect to all parameters of `graphvio.self_calibration.imu_model`.
 """
 
@@ -35,7 +35,7 @@ from graphvio.self_calibration.preintegration_errors import (
 
 
 class Preintegrated(NamedTuple):
-    """What the IMU says of the motion between two instants; frame body at the first of them, gravity not taken away.
+    """Motion between two instants by the IMU, in the body frame of the first one, with gravity not subtracted.
 
     The tangent is ``[rotation, velocity, position]``; rotation is perturbed on the right, ``R Exp(r)``.
 
@@ -44,11 +44,11 @@ class Preintegrated(NamedTuple):
         velocity: (3,) m/s.
         position: (3,) m.
         jacobian: (9, 25) derivative with respect to the parameters.
-        covariance: (9, 9) of the samples' white noise.
-        force_variances: (3,) of velocity, of position with velocity, and of position, by the accelerometer's noise
-            without its matrix.
+        covariance: (9, 9) covariance due to the samples' white noise.
+        force_variances: (3,) by the accelerometer's noise, the same along each axis, before its matrix is applied:
+            variance of velocity, covariance of position with velocity, and variance of position.
         middle_rotation: (3, 3) ``start_R_body`` in the middle of the interval.
-        duration_s: of the interval.
+        duration_s: duration of the interval.
     """
 
     rotation: Float
@@ -76,12 +76,13 @@ def preintegrate(
     Args:
         stamps_ns: (N,) increasing, of the IMU's clock.
         readings: (N, 6) gyro, rad/s, and accelerometer, m/s^2, frame body.
-        start_ns: of the interval.
-        end_ns: of the interval.
+        start_ns: start of the interval.
+        end_ns: end of the interval.
         parameters: (25,) of the IMU.
         noise_densities: (2,) white noise of gyro, rad/s/sqrt(Hz), and of accelerometer, m/s^2/sqrt(Hz).
-        max_gap_ns: between samples of one interval.
-        noise_factors: (N, 2) by which the noise's variance is larger from each sample to the next; None if it is not.
+        max_gap_ns: largest gap between samples of the interval.
+        noise_factors: (N, 2) factors on the variance of the noise of gyro and accelerometer, from each sample to the
+            next; None if they are 1.
 
     Raises:
         MeasurementError: if the samples do not cover the interval.
@@ -187,7 +188,7 @@ def integrate_samples(
 
 @kernel
 def _rotate(rotation: Float, calibrated: Float, force: Float) -> None:
-    """Rotate the specific force of rate and force (6,)."""
+    """Rotate the specific force, the last three of rate and force (6,)."""
     for r in range(3):
         force[r] = rotation[r, 0] * calibrated[3] + rotation[r, 1] * calibrated[4] + rotation[r, 2] * calibrated[5]
 

@@ -31,12 +31,12 @@ def add_derivatives(h: float, rotation: Float, force: Float, raw: Float, sums: F
 
     Args:
         h: duration of the step, s.
-        rotation: (3, 3) in its middle.
-        force: (3,) rotated by it.
+        rotation: (3, 3) rotation in the middle of the step.
+        force: (3,) specific force, rotated by it.
         raw: (6,) readings less bias.
         sums: (5, 4, 3, 3) derivatives of the rotation on the left, velocity and position with respect to rate, and of
-            velocity and position with respect to force: to an error that is constant, and to ones that are proportional
-            to each axis' reading.
+            velocity and position with respect to force: for an error that is constant, and for errors that are
+            proportional to the reading of each axis.
     """
     by_rate, rate_velocity, rate_position, force_velocity, force_position = sums
     fx, fy, fz = force
@@ -84,7 +84,7 @@ def fill_time_offset_column(
     rotation: Float, velocity: Float, position: Float, duration_s: float, at_start: Float, at_end: Float,
     end_force: Float, jacobian: Float,
 ) -> None:  # fmt: skip
-    """Fill the column of the time offset: both ends of the interval move over the readings."""
+    """Fill the column of the time offset, by which both ends of the interval move over the readings."""
     turned_v, turned_p = np.zeros(3), np.zeros(3)
     add_cross(1.0, at_start, velocity, turned_v)
     add_cross(1.0, at_start, position, turned_p)
@@ -107,13 +107,13 @@ def add_noise(
 
     Args:
         h: duration of the step, s.
-        force: (3,) in its middle.
+        force: (3,) specific force in the middle of the step.
         turned_s: duration of the steps before, each times its factor for the gyro.
-        noise_densities: (2,) of gyro and accelerometer.
-        noise_factors: (2,) by which their variances in this step are larger.
-        levers: (2, 3) of velocity and position.
+        noise_densities: (2,) white noise of gyro and accelerometer.
+        noise_factors: (2,) factors on their variances in this step.
+        levers: (2, 3) levers of velocity and position.
         spread: (3, 3, 3) covariances of velocity, of position with velocity, and of position, by the gyro's noise.
-        of_force: (3,) the same variances by the accelerometer's, which is the same in all directions.
+        of_force: (3,) the same variances by the accelerometer's noise, which is the same in all directions.
     """
     turn = noise_densities[0] ** 2 * (turned_s + 0.5 * h * noise_factors[0])
     noise = noise_densities[1] ** 2 * h * noise_factors[1]
@@ -162,11 +162,11 @@ def covariance_of(
     """Return the covariance (9, 9) from the parts of `add_noise`.
 
     Args:
-        rotation: (3, 3) of the interval.
+        rotation: (3, 3) rotation over the interval.
         turn: variance of the rotation.
-        levers: of `add_noise`, and the next two.
+        levers: see `add_noise`, also for the next two.
         spread: likewise.
-        of_force: likewise, of readings as they are.
+        of_force: likewise, before the accelerometer's matrix is applied.
         force_axes: (3, 3) the accelerometer's axes in the middle of the interval, by its matrix.
     """
     covariance = np.zeros((9, 9))

@@ -1,4 +1,4 @@
-"""What is known of a rig's calibration beforehand: the covariance of the rig file's values."""
+"""Prior of a rig's calibration: the covariance of the rig file's values."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from graphvio.self_calibration.parameters import (
     slices_of_groups,
 )
 
-_MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
+_MIN_DISTORTION = 0.005  # size of a coefficient from which on its standard deviation is a share of it
 _MIN_SIGMA = 1e-9
 _GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.05, 0.3
 SINGLE_FOCAL_SHARE, SINGLE_CENTRE_PX = 0.002, 1.0
-"""Errors of a single camera's lens that no covariance has: its tracks in real images have errors in common."""
+"""Errors of a single camera's lens that no covariance includes: in real images, its tracks have errors in common."""
 _BIAS_WALK_FACTOR = 2.0  # on the stated random walks, which are those of a sensor at one temperature
 
 
@@ -71,12 +71,12 @@ def file_prior(rig: Rig) -> FilePrior:
 
 
 def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
-    """Return the covariance (C, C) of what a calibration changes in one second, by heat and the like.
+    """Return the covariance (C, C) of a calibration's random walk in one second, by heat and the like.
 
     Args:
-        rig: of the prior; its IMU states the random walk of the biases.
-        prior: of the calibration.
-        share: standard deviation of the others, as a share of the prior's.
+        rig: rig of the prior; its IMU states the random walk of the biases.
+        prior: prior of the calibration.
+        share: standard deviation of the other parameters' walk, as a share of the prior's.
     """
     walk = share**2 * prior.covariance
     if rig.imu is not None:
@@ -90,11 +90,12 @@ def extrinsic_covariances(rig: Rig, covariance: Float) -> dict[int, Float]:
     """Return the covariances of the extrinsics of pairs and single cameras relative to the first pair.
 
     Args:
-        rig: G pairs and single cameras.
-        covariance: (C, C) of the calibration.
+        rig: rig of G pairs and single cameras.
+        covariance: (C, C) covariance of the calibration.
 
     Returns:
-        Index, of all but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``.
+        Index of each pair and single camera but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d)
+        body_T_left``.
     """
     n = n_camera_parameters(rig)
     of_cameras, found = covariance[:n, :n], {}
@@ -105,17 +106,17 @@ def extrinsic_covariances(rig: Rig, covariance: Float) -> dict[int, Float]:
 
 
 def refined_sigmas(rig: Rig, posterior: Gaussian, factors: Float) -> CalibrationSigmas:
-    """Return the standard deviations of a posterior, of each kind of parameter the largest.
+    """Return the standard deviations of a posterior for a rig file: of each kind of parameter the largest.
 
-    As a rig file's prior they know no correlations, such as those of the baselines with the accelerometer's scale,
-    which measurements show only relative to each other: the next run would take each for known by itself. They are
-    enlarged by one factor, until that prior is in no direction narrower than the posterior, but not beyond what was
-    known before.
+    A rig file's standard deviations contain no correlations, such as those of the baselines with the accelerometer's
+    scale, which measurements show only relative to each other: as a prior, they would let the next run take each as
+    known by itself. They are enlarged by one factor, until that prior is in no direction narrower than the posterior,
+    but not beyond what was known before.
 
     Args:
-        rig: with the calibration of the posterior, and the standard deviations of the rig file.
-        posterior: of the difference from the rig file.
-        factors: (2,) on the file's standard deviations with which it is the posterior.
+        rig: rig with the calibration of the posterior, and the standard deviations of the rig file.
+        posterior: posterior of the difference from the rig file.
+        factors: (2,) factors on the file's standard deviations, with which the posterior was computed.
     """
     covariance, known = posterior.covariance, rig.calibration_sigmas
     of_cameras = covariance[: n_camera_parameters(rig), : n_camera_parameters(rig)]
@@ -182,7 +183,7 @@ def _scaled(known: CalibrationSigmas, factors: Float) -> CalibrationSigmas:
 
 
 def _distortion_shares(camera: Camera, sigmas: Float) -> Float:
-    """Return the standard deviations (DISTORTION,) of a camera's coefficients as shares of what a file's refer to."""
+    """Return the standard deviations (DISTORTION,) of a camera's coefficients as shares of `_distortion_sizes`."""
     size = _distortion_sizes(camera)
     return np.divide(sigmas[INTRINSICS:], size, out=np.zeros(DISTORTION), where=size > 0.0)
 
@@ -243,6 +244,6 @@ def _sigmas_of_lens(camera: Camera, known: CalibrationSigmas) -> Float:
 
 
 def _distortion_sizes(camera: Camera) -> Float:
-    """Return what a standard deviation of each coefficient (DISTORTION,) is a share of; 0 where there is none."""
+    """Return the size (DISTORTION,) of each coefficient that its standard deviation is a share of; 0 for none."""
     given = np.where(has_coefficient(camera), camera.distortion[:DISTORTION], 0.0)
     return np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)

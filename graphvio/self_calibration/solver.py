@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over the states of a window and the calibration, and what it says of the calibration."""
+"""Levenberg-Marquardt over the states of a window and the calibration, and the calibration's posterior."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
-_ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
+_ROBUST_SCALE = 2.5  # scale of the Cauchy cost, in standard deviations
 _MAX_STEPS = 25  # far points, by the rig file, may be anywhere at first
-_CONVERGED = 0.05  # standard deviations of the prior
-_LOOSE_ROTATION_SIGMA, _LOOSE_POSITION_SIGMA = np.deg2rad(5.0), 0.3  # keep poses that no track constrains
+_CONVERGED = 0.05  # change of the calibration, in standard deviations of the prior
+_LOOSE_ROTATION_SIGMA, _LOOSE_POSITION_SIGMA = np.deg2rad(5.0), 0.3  # priors that hold poses without tracks
 _LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
 _LOOSE_SCALE_SIGMA = 5.0  # of distances and velocities: where all points are far, wrong cameras see a wrong scale
 _FIXED = 1e-9
-_FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the landmarks' and the others' own information
-_MAX_LAST_DAMPING = 1e-5  # a step that more damping makes small does not say that this is the minimum
+_FIRST_DAMPING, _MIN_DAMPING = 1e-6, 1e-9  # shares of the diagonal, of landmarks and of the other unknowns
+_MAX_LAST_DAMPING = 1e-5  # with more damping, a small step does not show that this is the minimum
 _MAX_DAMPING = 1e2  # beyond it steps change nothing
 _LESS_DAMPING, _MORE_DAMPING = 0.1, 100.0  # after a step that lowers the cost, and after one that does not
 _MIN_DAMPING_AFTER_A_FAILURE = 1e-4
@@ -36,7 +36,7 @@ class States(NamedTuple):
     """Unknowns of a window beside the calibration: K keyframes and L landmarks.
 
     Attributes:
-        poses: (K, 4, 4) ``odom_T_body``; the first one stays.
+        poses: (K, 4, 4) ``odom_T_body``; the first one is fixed.
         velocities: (K, 3) m/s, frame odom.
         gravity: (3,) m/s^2, frame odom.
         landmarks: (L, 3), in frames that move along with poses, see `landmarks_after`.
@@ -52,8 +52,8 @@ class Window(NamedTuple):
     """Measurements of a window.
 
     Attributes:
-        tracks: of all pairs.
-        samples: of the IMU, or None.
+        tracks: tracks of all pairs and single cameras.
+        samples: IMU samples, or None.
     """
 
     tracks: Tracks
@@ -61,17 +61,17 @@ class Window(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """A window's adjustment.
+    """Result of a window's adjustment.
 
     Attributes:
-        states: adjusted.
+        states: adjusted states.
         calibration: posterior of the difference from the nominal calibration.
         window: what was adjusted, with the frames of the adjusted landmarks.
         errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
         imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
-        hessian: of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
-        has_converged: whether the last step, with next to no damping, hardly changed the calibration; else it is no
-            minimum, and says nothing.
+        hessian: Hessian of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
+        has_converged: whether the last step, with next to no damping, hardly changed the calibration; otherwise the
+            solution is no minimum, and is no evidence.
     """
 
     states: States
@@ -83,10 +83,11 @@ class Solution(NamedTuple):
     has_converged: bool
 
     def poses_by_cameras(self, n_camera_parameters: int) -> Float:
-        """Return how the poses depend on the cameras' parameters, the first ones of the calibration.
+        """Return the derivatives of the poses with respect to the cameras' parameters, the first ones of all.
 
         Returns:
-            (K, 6, n_camera_parameters) derivatives of the poses, errors in their own frames; the other unknowns follow.
+            (K, 6, n_camera_parameters) derivatives of the poses' errors in their own frames, while the other unknowns
+            follow so that the cost stays minimal.
         """
         n = 6 * len(self.states.poses)
         cameras = np.arange(n, n + n_camera_parameters)
@@ -109,10 +110,10 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
 
     Args:
         window: measurements.
-        states: initial.
+        states: initial states.
         nominal: calibration of the rig file.
         difference: (C,) initial difference from it: of the cameras, and with an IMU also of its parameters.
-        prior: of that difference.
+        prior: prior of that difference.
     """
     first = states
     found = Eliminated.empty(window.tracks)
@@ -199,12 +200,12 @@ def _linearise(
 
 
 def _visual_columns(n: int, nominal: RigCalibration) -> Int:
-    """Return where ``[poses, cameras]`` of K keyframes are among the unknowns of `eliminate_landmarks`."""
+    """Return the indices of ``[poses, cameras]`` of K keyframes among the unknowns of `eliminate_landmarks`."""
     return np.concatenate([np.arange(6 * n), 6 * n + nominal.columns])
 
 
 def _inertial_columns(n: int, c: int, n_camera_parameters: int) -> Int:
-    """Return where ``[poses, velocities, gravity, parameters]`` of K keyframes are among a window's unknowns."""
+    """Return the indices of ``[poses, velocities, gravity, parameters]`` of K keyframes among a window's unknowns."""
     after = 6 * n + c
     return np.concatenate(
         [np.arange(6 * n), np.arange(after, after + 3 * n + 3), 6 * n + n_camera_parameters + np.arange(PARAMETERS)]
@@ -212,14 +213,14 @@ def _inertial_columns(n: int, c: int, n_camera_parameters: int) -> Int:
 
 
 def _loose_pose_sigmas(poses: Float) -> Float:
-    """Return the standard deviations (6 K,) of poses (K, 4, 4) that hardly hold them, nor how far they are apart."""
+    """Return the standard deviations (6 K,) of a prior of poses (K, 4, 4), weak for them and for their distances."""
     distances = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
     positions = _LOOSE_POSITION_SIGMA + _LOOSE_SCALE_SIGMA * distances
     return np.repeat(np.column_stack([np.full(len(poses), _LOOSE_ROTATION_SIGMA), positions]), 3)
 
 
 def _add_loose(states: States, first: States, hessian: Float, gradient: Float, at: int) -> float:
-    """Add what is known of velocities and gravity beforehand: next to nothing but gravity's norm. Returns the cost."""
+    """Add a weak prior of velocities and gravity, and a strong one of gravity's norm; return the cost."""
     velocities = np.arange(at, at + states.velocities.size)
     off = (states.velocities - first.velocities).ravel()
     speeds = np.linalg.norm(first.velocities, axis=1)
@@ -243,7 +244,7 @@ def _add_loose(states: States, first: States, hessian: Float, gradient: Float, a
 def _moved(
     window: Window, states: States, nominal: RigCalibration, difference: Float, eliminated: Eliminated, step: Float
 ) -> tuple[Window, States]:
-    """Return the states after a step, and the window with the frames of the landmarks then; these follow from it."""
+    """Return the window after a step, with the landmarks' new frames, and the states with the landmarks that follow."""
     n, n_camera_parameters = len(states.poses), len(nominal.columns)
     poses = states.poses.copy()
     for k, of_pose in enumerate(step[: 6 * n].reshape(n, 6)):

@@ -1,4 +1,4 @@
-"""Kernels of the self-calibration, compiled or loaded before the first window is adjusted."""
+"""Warm-up of the kernels of the self-calibration: they are compiled or loaded before the first window is adjusted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def warm_up_adjustment(rig: Rig) -> None:
     prior = Evidence.none(len(of_file.group)).given(of_file, np.ones(of_file.n_groups))
     samples, nominal = collector.samples_of(keyframes), RigCalibration.of(rig)
     adjusted(keyframes, samples, nominal, prior.mean, prior, FIRST_WINDOW_SIGMA_PX)
-    information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
+    information, right = np.eye(2), np.zeros((2, 2))  # for `evidence`, `solver` and `inertial_state`
     solve_lower(cholesky(information), right)
     solve_rows(information, right)
     inverse(information)

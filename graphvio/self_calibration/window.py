@@ -1,4 +1,4 @@
-"""The window of keyframes that a bundle adjustment takes, and the tracks that it chooses from them."""
+"""Keyframes of a window for bundle adjustment, and the choice of tracks from them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from graphvio.cameras import unproject_pixels
 from graphvio.self_calibration.bundle import Tracks
 from graphvio.self_calibration.parameters import RigCalibration
 
-_MAX_ERROR2 = 25.0  # squared whitened error of a view of what stands still
+_MAX_ERROR2 = 25.0  # squared whitened error of a view of a landmark that stands still
 _MAX_OFF = 0.3  # share of a landmark's views that may be farther off
-_RAY_SIGMA = 1e-3  # of normalised coordinates
+_RAY_SIGMA = 1e-3  # noise of normalised coordinates
 _MAX_INVERSE_DEPTH_SIGMA = 0.1  # 1/m, of a single camera's landmarks to begin with
-_MIN_DEPTH_RATIO = 0.1  # of depths in two cameras, where one has turned away from a point
+_MIN_DEPTH_RATIO = 0.1  # of a point's depths in two views, below which one camera has turned away from it
 
 
 class View(NamedTuple):
@@ -24,10 +24,10 @@ class View(NamedTuple):
 
     Attributes:
         ids: (N,) identities, increasing.
-        left_px: (N, 2) in the left image.
-        right_px: (N, 2) in the right image; meaningful where ``has_right``.
+        left_px: (N, 2) pixels in the left image.
+        right_px: (N, 2) pixels in the right image; meaningful where ``has_right``.
         has_right: (N,) whether a match was found there; never by a single camera.
-        inverse_depths: (N,) in the left camera's frame, 1/m; meaningful where ``has_right``.
+        inverse_depths: (N,) inverse depths in the left camera's frame, 1/m; meaningful where ``has_right``.
     """
 
     ids: Int
@@ -41,8 +41,8 @@ class Keyframe(NamedTuple):
     """One instant of the window.
 
     Attributes:
-        stamp_ns: of the frameset.
-        odom_T_body: (4, 4) as it was estimated then.
+        stamp_ns: stamp of the frameset.
+        odom_T_body: (4, 4) pose as it was estimated then.
         views: index of the pair or single camera -> what it saw.
     """
 
@@ -54,14 +54,14 @@ class Keyframe(NamedTuple):
 def choose_tracks(
     keyframes: Sequence[Keyframe], poses: Float, calibration: RigCalibration, max_tracks: int, sigma_px: float
 ) -> tuple[Tracks, Float]:
-    """Choose the longest tracks of each pair and single camera whose depth is known, and where their landmarks are.
+    """Choose the longest tracks of known depth of each pair and single camera, and find where their landmarks are.
 
     Args:
-        keyframes: K of them, in time order.
+        keyframes: K keyframes, in time order.
         poses: (K, 4, 4) ``odom_T_body``.
-        calibration: of pairs and single cameras. Those of a pair were matched left to right; the depth of those of a
-            single camera comes from the poses.
-        max_tracks: of each pair or camera.
+        calibration: calibration of the pairs and single cameras. Depths of a pair's tracks come from its stereo
+            matches; those of a single camera's come from the poses.
+        max_tracks: largest number of tracks of each pair or camera.
         sigma_px: noise of a corner's position.
 
     Returns:
@@ -113,9 +113,9 @@ def inverse_depths_of_tracks(ids: Int, rays: Float, odom_T_cam: Float) -> tuple[
     """Triangulate a camera's tracks from where it was, by linear least squares.
 
     Args:
-        ids: (N,) identities of the observations, sorted, those of a track in time order.
+        ids: (N,) identities of the observations' tracks, sorted, those of a track in time order.
         rays: (N, 2) normalised coordinates.
-        odom_T_cam: (N, 4, 4) of the camera at each.
+        odom_T_cam: (N, 4, 4) pose of the camera at each observation.
 
     Returns:
         Inverse depths (N,) in the camera that saw the track first, 1/m, the same for all its observations, and whether
@@ -130,7 +130,7 @@ def inverse_depths_of_tracks(ids: Int, rays: Float, odom_T_cam: Float) -> tuple[
     homogeneous = np.column_stack([rays, np.ones(len(rays))])
     ahead = np.einsum("nij,njk,nk->ni", rotation, odom_T_cam[first, :3, :3], homogeneous[first])
     shift = np.einsum("nij,nj->ni", rotation, odom_T_cam[first, :3, 3] - odom_T_cam[:, :3, 3])
-    # A point seen at (x, y) is (ahead + w shift) there; what is across the ray vanishes.
+    # The point is at (ahead + w shift), up to scale, in the camera that saw it at (x, y): what is across that ray is 0.
     depth = np.maximum(ahead[:, 2], _MIN_DEPTH_RATIO)[:, None]
     by_depth = (shift[:, :2] - rays * shift[:, 2:]) / depth
     off = (ahead[:, :2] - rays * ahead[:, 2:]) / depth

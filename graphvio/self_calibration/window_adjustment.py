@@ -1,4 +1,4 @@
-"""What one window says of the calibration, together with the full windows before it."""
+"""Adjustment of one window, and the estimate of the calibration from it and the full windows before it."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from graphvio.self_calibration.prior import extrinsic_covariances
 from graphvio.self_calibration.solver import Solution
 from graphvio.self_calibration.window import Keyframe
 
-_MIN_CHANGE = 0.5  # of the file's factors, down to which a window is not adjusted again
+_MIN_CHANGE = 0.5  # ratio of new to old factors of the file, down to which a window is not adjusted again
 
 
 class AdjustedWindow(NamedTuple):
-    """A window's result.
+    """Result of a window's adjustment.
 
     Attributes:
-        keyframes: of the window.
+        keyframes: keyframes of the window.
         is_full: whether the window is full.
-        prior: of the calibration's difference from the rig file, from before the window.
-        solution: of the window by itself.
-        evidence: of this window and the full ones before.
-        estimate: of the calibration, by this evidence and the rig file.
+        prior: prior of the calibration's difference from the rig file, from before the window.
+        solution: solution of the window.
+        evidence: evidence of this window and the full ones before.
+        estimate: estimate of the calibration, by this evidence and the rig file.
         extrinsics: see `graphvio.self_calibration.online.SelfCalibration`.
         upper_covariance: see there.
-        covariance: (C, C) of the cameras' parameters that come into force.
-        by_cameras: derivatives of the keyframes' poses with respect to the cameras' parameters.
+        covariance: (N, N) mean square of the error of the cameras' N parameters that come into force.
+        by_cameras: (K, 6, N) derivatives of the K keyframes' poses with respect to these parameters.
         inertial_state: at the last keyframe, or None without an IMU, or while the rig file is as good as exact.
     """
 
@@ -65,17 +65,17 @@ class AdjustedWindow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class WindowAdjustment:
-    """A window that is to be adjusted, with all that the result depends on: another thread may do it.
+    """A window that is to be adjusted, with all that the result depends on, so that another thread can do it.
 
     Attributes:
-        rig: from the rig file.
+        rig: rig of the rig file.
         nominal: its calibration.
-        file_prior: how far that is known.
-        factors: (G,) by which the rig file is taken to be wrong.
-        evidence: of the full windows before.
-        difference: (C,) of the calibration from the rig file, to begin at.
-        keyframes: of the window.
-        samples: of the IMU over it, or None.
+        file_prior: prior of the calibration by the rig file.
+        factors: (G,) factors by which the rig file is taken to be wrong.
+        evidence: evidence of the full windows before.
+        difference: (C,) initial difference of the calibration from the rig file.
+        keyframes: keyframes of the window.
+        samples: IMU samples over it, or None.
         sigma_px: noise of a corner's position.
         is_full: whether the window is full.
     """
@@ -92,19 +92,19 @@ class WindowAdjustment:
     is_full: bool
 
     def result(self) -> AdjustedWindow | None:
-        """Adjust the window; None where the measurements determine nothing, or an IMU that is impossible."""
+        """Adjust the window; None if it does not converge, or measurements determine nothing or an impossible IMU."""
         try:
             fitted = self._fitted(self.factors, self.difference)
             change = inexact(fitted.factors) / inexact(self.factors)
             if fitted.solution.has_converged and ((change > 1.0) | (change < _MIN_CHANGE)).any():
-                # What the window says was linearised where quite another file led it, or a file that is less exact.
+                # The window was linearised with factors that are too small or much too large: use the new ones.
                 fitted = self._fitted(fitted.factors, fitted.solution.calibration.mean)
             return self._judged(fitted) if fitted.solution.has_converged else None
         except (np.linalg.LinAlgError, RigError):
             return None
 
     def _fitted(self, factors: Float, difference: Float) -> _Fitted:
-        """Solve the window with the rig file as wrong as some factors say, and find which are likeliest then."""
+        """Solve the window with a rig file that is wrong by factors (G,), and find the likeliest factors given that."""
         prior = self.evidence.given(self.file_prior, inexact(factors))
         solution = adjusted(self.keyframes, self.samples, self.nominal, difference, prior, self.sigma_px)
         evidence = self.evidence.with_window(prior, solution.calibration)
@@ -113,7 +113,7 @@ class WindowAdjustment:
         return _Fitted(prior, solution, evidence, likelihood, *found)
 
     def _judged(self, fitted: _Fitted) -> AdjustedWindow:
-        """Return what is known of the calibration now, and what of it comes into force."""
+        """Return the estimate of the calibration after the window, and what of it comes into force."""
         evidence, factors, n = fitted.evidence, fitted.factors, n_camera_parameters(self.rig)
         is_changed, in_force = self.file_prior.change is not None, np.zeros_like(self.difference)
         if is_changed or (factors != EXACT).any():

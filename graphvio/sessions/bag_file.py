@@ -1,4 +1,4 @@
-"""Reads ROS 1 bags, and ROS 2 bags, folders or SQLite files, by the ``rosbags`` library, without ROS."""
+"""Reader of ROS 1 bags, and of ROS 2 bags as folders or SQLite files, with the ``rosbags`` library, without ROS."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ with importing("rosbags", "sessions", "reading a bag"):
 
 
 class BagFile(Store):
-    """A bag, ``NAME.bag``, ``NAME.db3`` or the folder of a ROS 2 bag.
+    """A bag: ``NAME.bag``, ``NAME.db3`` or the folder of a ROS 2 bag.
 
-    Its messages are read as those of ROS 2, of the topics that are wanted. The whole bag is read once for the stamps of
-    its messages' headers; messages are read again when they are wanted.
+    Messages of the wanted topics are read as those of ROS 2. The whole bag is read once for the stamps of its messages'
+    headers; single messages are read again by `read`.
     """
 
     def __init__(self, path: Path, is_wanted: Callable[[str], bool] = lambda topic: True) -> None:
@@ -46,11 +46,11 @@ class BagFile(Store):
         return self._as_cdr(connection, data)
 
     def _found(self, connection: Any, place: Place) -> Any:
-        """Messages of a connection, the first of them the one at a place: by row in ROS 1, by time in ROS 2."""
+        """Return the messages of a connection from the one at a place on: by row in ROS 1, by time in ROS 2."""
         if self._reader.is2:
             return self._reader.messages([connection], start=place.offset, stop=place.offset + 1)
         rows = self._indexes[place.chunk]
-        # The library would read all messages before the wanted one; so it gets an index of that one only.
+        # The library would read all messages before the wanted one, so it is given an index of that one only.
         connection.owner.indexes[connection.id] = rows[place.offset : place.offset + 1]
         return self._reader.messages([connection])
 
@@ -71,7 +71,7 @@ class BagFile(Store):
             row = rows[number]
             rows[number] += 1
             if self._reader.is2 and topic.logged_ns and topic.logged_ns[-1] == logged_ns:
-                continue  # it could not be distinguished from the one before
+                continue  # it could not be distinguished from the previous message
             topic.logged_ns.append(logged_ns)
             topic.places.append(Place(number, logged_ns if self._reader.is2 else row))
             if connection.msgtype in STAMPED:

@@ -1,4 +1,4 @@
-"""Writes ROS 1 bags and ROS 2 bags by the ``rosbags`` library, without ROS."""
+"""Writer of ROS 1 bags and ROS 2 bags with the ``rosbags`` library, without ROS."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ with importing("rosbags", "sessions", "writing a bag"):
     from rosbags import rosbag1, rosbag2
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-_ROS2_VERSION: Final = 8  # of metadata.yaml; the newest whose QoS profiles older distributions read, too
+_ROS2_VERSION: Final = 8  # of metadata.yaml; the newest version whose QoS profiles older distributions read, too
 _FOREVER = QosTime(9223372036, 854775807)  # as ROS writes it
 _LATCHED = Qos(  # the quality of service of ROS 2 that corresponds to a latched topic of ROS 1
     history=QosHistory.KEEP_LAST,
@@ -33,7 +33,7 @@ _LATCHED = Qos(  # the quality of service of ROS 2 that corresponds to a latched
 
 
 class _Bag:
-    """Common part of bags of ROS 1 and ROS 2: see `Storage`; a `SessionError` where the target exists."""
+    """Common part of bags of ROS 1 and ROS 2: see `Storage`; raises a `SessionError` if the target exists."""
 
     has_attachments = False
     is_readable_when_cut = False
@@ -72,7 +72,7 @@ class Ros1Storage(_Bag):
         self._connections: dict[str, tuple[Any, int]] = {}  # topic -> connection, messages so far
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a ROS 2 message as the ROS 1 message: see `Storage`."""
+        """Store a ROS 2 message as the corresponding ROS 1 message: see `Storage`."""
         if topic not in self._connections:
             name = ros1.type_name(message.__msgtype__)
             latching = 1 if is_latched else None
@@ -84,7 +84,7 @@ class Ros1Storage(_Bag):
 
 
 class Ros2Storage(_Bag):
-    """A ROS 2 bag: a folder with an SQLite file, which holds its messages once it is finished."""
+    """A ROS 2 bag: a folder with an SQLite file, which has all messages only after `finish`."""
 
     def __init__(self, path: Path) -> None:
         sqlite = rosbag2.StoragePlugin.SQLITE3

@@ -22,10 +22,10 @@ def types() -> Any:
 
 
 def add_type(store: Any, name: str, text: str) -> None:
-    """Add a type to those of a distribution, such as a service's requests, by the text of its definition."""
+    """Add a type, such as a service's request, to those of a distribution, given the text of its definition."""
     from rosbags.typesys import get_types_from_msg
 
-    (fields,) = get_types_from_msg(text, name).values()  # whose own name always has "msg" in it
+    (fields,) = get_types_from_msg(text, name).values()  # the key, the library's own name, always has "msg" in it
     store.register({name: fields})
 
 
@@ -47,12 +47,12 @@ def encode(message: Any) -> bytes:
 
 
 def decode(data: bytes, type_name: str, where: object = "a message", known: Any = None) -> Any:
-    """Decode a message from CDR; its arrays are views of the data. ``where`` it is from is for errors.
+    """Decode a message from CDR; its arrays are views of the data.
 
-    ``known`` are rosbags' types, those of `types` by default.
+    ``where`` names the message's origin for errors; ``known`` are rosbags' types, those of `types` by default.
 
     Raises:
-        SessionError: if it is damaged.
+        SessionError: if the message is damaged.
     """
     known = types() if known is None else known
     try:
@@ -72,7 +72,7 @@ def stamp_ns(data: bytes) -> int:
     """Return the stamp of a message that begins with a header, without decoding the other fields.
 
     Raises:
-        SessionError: if the message is too short to have one.
+        SessionError: if the message is too short to have a header.
     """
     if len(data) < 12:
         raise SessionError(f"a message of {len(data)} bytes has no header; copy the file again")

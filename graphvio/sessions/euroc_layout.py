@@ -15,7 +15,7 @@ from graphvio.rig_files import kalibr
 
 IMU_FOLDER, TRUTH_FOLDER = "imu0", "state_groundtruth_estimate0"
 MASKS_FOLDER = "masks"
-"""Beside a camera's ``data``: masks of its images, ``STAMP.png``."""
+"""Folder beside a camera's ``data`` with masks of its images, ``STAMP.png``."""
 FRAME_HEADER = "#timestamp [ns],filename"
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -28,7 +28,7 @@ STATE_HEADER = (
     "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
 )
 
-_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly compresses any better
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # more effort hardly compresses noise any better
 
 
 def write_image(path: Path, image: Image) -> None:
@@ -45,12 +45,12 @@ def frame_row(stamp_ns: int) -> str:
 
 
 def rounded_row(stamp_ns: int, values: Iterable[float]) -> str:
-    """Return a row of a table with twelve significant digits."""
+    """Return a row of a table whose values have twelve significant digits."""
     return f"{stamp_ns}," + ",".join(f"{value:.12g}" for value in values)
 
 
 def exact_row(stamp_ns: int, values: Iterable[float]) -> str:
-    """Return a row of a table whose values read back to the last digit."""
+    """Return a row of a table whose values can be read back exactly."""
     return f"{stamp_ns}," + ",".join(repr(float(value)) for value in values)
 
 
@@ -81,7 +81,7 @@ def imu_yaml(imu: Imu, comment: str) -> str:
 
 
 def truth_yaml(comment: str) -> str:
-    """Return the truth's ``sensor.yaml``: poses of body."""
+    """Return the ``sensor.yaml`` of the true trajectory, whose poses are those of body."""
     return f"sensor_type: visual-inertial\ncomment: {comment}\n{_matrix_yaml(np.eye(4))}"
 
 

@@ -1,4 +1,4 @@
-"""Writes a recording in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
+"""Writer of recordings in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _COMMENT = "converted by graphvio"
 
 
 class EurocWriter(RecordingWriter):
-    """Writes measurements as a folder; values of the IMU and poses read back to the last digit.
+    """Writes measurements as a folder; values of the IMU and poses can be read back exactly.
 
     Images have the stamps of their framesets.
 
     Args:
-        path: of the folder, which must not exist, or be empty.
-        rig: of the framesets.
+        path: path of the folder, which must not exist, or be empty.
+        rig: the rig of the framesets.
 
     Attributes:
-        rig: as written: its cameras are renamed to ``cam0``, ``cam1`` and so on if they have other names, and have no
-            offsets of stamps, as those of framesets are corrected.
+        rig: the rig as written: its cameras are renamed to ``cam0``, ``cam1`` and so on if they have other names, and
+            have no stamp offsets, as the stamps of framesets are corrected.
 
     Raises:
         SessionError: if the folder is not empty or cannot be created.
@@ -137,5 +137,5 @@ def _renamed(rig: Rig) -> Rig:
 
 
 def _rate_hz(stamps_ns: list[int]) -> float:
-    """Rate by the median interval; 0 if there is none."""
+    """Return the rate from the median interval; 0 if there is none."""
     return 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0

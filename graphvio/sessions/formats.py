@@ -17,7 +17,7 @@ _BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag1"}
 
 
 def format_of(path: Path, asked: str | None) -> str:
-    """Return the format, one of `FORMATS`, in which a path is written.
+    """Return the format, one of `FORMATS`, in which a file or folder is to be written.
 
     Raises:
         SessionError: if the name does not show the format, or contradicts it.
@@ -41,10 +41,10 @@ def open_writer(path: Path, rig: Rig, file_format: str, image_format: ImageForma
     """Create a file or folder of a format.
 
     Args:
-        path: of the file or folder, which must not exist.
-        rig: of the framesets.
+        path: path of the file or folder, which must not exist.
+        rig: the rig of the framesets.
         file_format: one of `FORMATS`.
-        image_format: of images in sessions and bags; the EuRoC layout always has PNG.
+        image_format: format of images in sessions and bags; the EuRoC layout always has PNG.
 
     Raises:
         SessionError: if the target exists or cannot be created.

@@ -1,7 +1,7 @@
-"""Reads MCAP files, also those whose writing was cut short: the place of each message, and its bytes.
+"""Reader of MCAP files, also of those whose writing was cut short: the place of each message, and its bytes.
 
-A file that was cut short has no summary at its end. What the summary says also stands before it, after each chunk; so a
-file is scanned from the front, without unpacking its chunks, as far as it goes.
+A file that was cut short has no summary at its end. The same information also stands after each chunk, so a file is
+scanned from the front, as far as it goes, without unpacking its chunks.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class McapFile(Store):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.is_whole = False  # until its end is found
+        self.is_whole = False  # until the file's end is found
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Topic] = {}
         self._pending: list[tuple[int, Any]] = []  # chunks and indexes of channels that are not known yet
@@ -79,7 +79,7 @@ class McapFile(Store):
 
     @property
     def damaged_chunks(self) -> int:
-        """How many of the chunks that have been read so far are damaged."""
+        """Number of damaged chunks among those that have been read so far."""
         return len(self._damaged_chunks)
 
     def _unreadable(self, place: Place, why: str) -> SessionError:
@@ -109,7 +109,7 @@ class McapFile(Store):
         self._take_pending()
 
     def _scan_record(self, opcode: int, chunk: int, at: int) -> None:
-        """Read a record outside of chunks; of the summary, only what may have been lost with a chunk."""
+        """Read a record outside of chunks; of the summary, only schemas and channels that were lost with a chunk."""
         if opcode < _MIN_PRIVATE:
             Opcode(opcode)  # raises a ValueError if there is no such record
         if not self.is_whole:
@@ -178,9 +178,9 @@ class McapFile(Store):
             topic.places.append(Place(chunk, offset, channel, logged_ns))
 
     def _parsed(self, at: int) -> Any:
-        """Return the record at a position, as the library has it."""
+        """Return the record at a position as an object of the library."""
         opcode, record = _read_record(self._file, at, self._size)
-        if opcode == Opcode.ATTACHMENT:  # the library does not verify these
+        if opcode == Opcode.ATTACHMENT:  # the library does not verify attachments
             crc = int.from_bytes(record[-4:], "little")
             if crc and crc != zlib.crc32(record[_PREFIX.size : -4]):
                 raise ValueError("checksum of an attachment")
@@ -205,7 +205,7 @@ class McapFile(Store):
 
 
 def _read_record(stream: BinaryIO, at: int, size: int) -> tuple[int, bytes]:
-    """Opcode and bytes of a record, with its prefix, of a stream of a size."""
+    """Return the opcode of a record and its bytes with the prefix, from a stream of ``size`` bytes."""
     stream.seek(at)
     opcode, length = _PREFIX.unpack(stream.read(_PREFIX.size))
     stream.seek(at)

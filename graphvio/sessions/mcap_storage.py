@@ -1,4 +1,4 @@
-"""Writes MCAP files that lose at most the last second in a crash."""
+"""Writer of MCAP files that lose at most the last second in a crash."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Converts measurements, rigs and estimates to ROS 2 messages and back."""
+"""Conversion of measurements, rigs and estimates to ROS 2 messages and back."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 LOG, TEXT = "rcl_interfaces/msg/Log", "std_msgs/msg/String"
 STAMPED = (IMAGE, COMPRESSED, IMU, CAMERA_INFO, ODOMETRY, POSE)
-"""Types that begin with a header."""
+"""Types of messages that begin with a header."""
 ODOM, BODY = "odom", "base_link"
-"""Names of the frames nav and body, by REP 105."""
+"""ROS names of the frames nav and body, as in REP 105."""
 WORLD = "world"
 """Frame of the true trajectory."""
 
@@ -34,7 +34,7 @@ _NS_PER_S = 1_000_000_000
 _STAMP_END_S = 2**31
 _UNKNOWN = -1.0  # in the first element of a covariance: the quantity is not measured
 ROS_DISTORTIONS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant", "rational": "rational_polynomial"}
-"""ROS's names of lens models; others, for which it has none, have graphvio's."""
+"""ROS's names of lens models; models for which ROS has no name are written with graphvio's."""
 _WARN = 30
 
 
@@ -135,9 +135,9 @@ def transform(stamp_ns: int, parent: str, child: str, parent_T_child: Float) -> 
 def odometry(estimate: Estimate) -> Any:
     """Return the message of an estimate that has a pose.
 
-    ROS orders covariances ``[translation, rotation]``, that of the pose in the fixed axes. Angular rates are those of
-    the newest interval: fused, or else of the gyro, or else of vision. Values that are not estimated, such as the
-    covariance of the rates, are NaN.
+    ROS orders covariances ``[translation, rotation]``, and that of the pose is in the fixed axes. Angular rates are
+    those of the newest interval: the fused ones, otherwise those of the gyro, otherwise those of vision. Values that
+    are not estimated, such as the covariance of the rates, are NaN.
     """
     assert estimate.nav_T_body is not None
     assert estimate.covariance is not None
@@ -169,8 +169,8 @@ def pose_with_covariance(a_T_body: Float, covariance: Float) -> Any:
     """Return a ``geometry_msgs/PoseWithCovariance``.
 
     Args:
-        a_T_body: (4, 4).
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+        a_T_body: pose (4, 4) of body.
+        covariance: its covariance (6, 6), tangent ``[rotation, translation]`` in body.
     """
     turned = _fixed_axes(a_T_body)
     return make(
@@ -233,7 +233,7 @@ def _time(stamp_ns: int) -> Any:
 
 
 def _fixed_axes(a_T_body: Float) -> Float:
-    """(6, 6): from a tangent ``[rotation, translation]`` in body to ROS's ``[translation, rotation]`` in a's axes."""
+    """Return the (6, 6) map from ``[rotation, translation]`` in body to ROS's ``[translation, rotation]`` in a."""
     turned = np.zeros((6, 6))
     turned[:3, 3:] = turned[3:, :3] = a_T_body[:3, :3]
     return turned

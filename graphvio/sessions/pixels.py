@@ -1,4 +1,4 @@
-"""Converts the images in ROS messages to grey."""
+"""Conversion of the images in ROS messages to grey."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphvio.arrays import Image
 from graphvio.image_decoding import ImageError, decode_grey
 from graphvio.measurements.events import EventKind
 
-_TO_GREY = {  # all by 0.299 R + 0.587 G + 0.114 B
+_TO_GREY = {  # all compute 0.299 R + 0.587 G + 0.114 B
     "bgr": cv2.COLOR_BGR2GRAY,
     "rgb": cv2.COLOR_RGB2GRAY,
     "bgra": cv2.COLOR_BGRA2GRAY,
@@ -25,14 +25,14 @@ _CHANNELS = {"bgr": 3, "rgb": 3, "bgra": 4, "rgba": 4}
 _BRIGHTNESS = {  # where Y is in a row: first byte, and bytes from one to the next
     "yuv422": (1, 2), "uyvy": (1, 2), "yuv422_yuy2": (0, 2), "yuyv": (0, 2), "nv21": (0, 1), "nv24": (0, 1),
 }  # fmt: skip
-_SYNONYMS = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}  # OpenCV's order where none is named
+_SYNONYMS = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}  # OpenCV's order if none is named
 
 
 def grey(message: Any, where: str) -> Image:
     """Convert a ``sensor_msgs/Image`` or ``CompressedImage`` to grey (height, width) uint8.
 
     Raises:
-        ImageError: if it is damaged, or its encoding is not known.
+        ImageError: if the image is damaged, or its encoding is not known.
     """
     if hasattr(message, "format"):
         return decode_grey(bytes(message.data), where)
@@ -43,7 +43,7 @@ def grey(message: Any, where: str) -> Image:
     rows = rows[: step * height].reshape(height, step)
     if encoding in _BRIGHTNESS:
         first, period = _BRIGHTNESS[encoding]
-        return rows[:, first::period][:, :width].copy()  # a view could not be written to, nor compiled kernels take it
+        return rows[:, first::period][:, :width].copy()  # a view would be read-only, and no input for compiled kernels
     encoding = _SYNONYMS.get(encoding, encoding)
     kind, depth = encoding.rstrip("0123456789"), 2 if encoding.endswith("16") else 1
     if (kind != "mono" and kind not in _TO_GREY) or encoding not in (f"{kind}8", f"{kind}16"):

@@ -1,4 +1,4 @@
-"""Makes a rig of the messages of a recording: intrinsics of ``camera_info``, extrinsics of ``tf_static``."""
+"""Construction of a rig from a recording's messages: intrinsics from ``camera_info``, extrinsics from ``tf_static``."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _WORDS = tuple(side for sides in _SIDES for side in sides)
 
 
 def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
-    """Make the rig of all stereo pairs that have images, ``camera_info`` and extrinsics; None if there is none.
+    """Make the rig of all stereo pairs that have images, ``camera_info`` and extrinsics; None if there is no pair.
 
-    A pair's topics differ in one part of their name only: ``left`` and ``right``, ``infra1`` and ``infra2``. Of several
-    topics with one camera's images one is used (see `preference`), and of several with samples of an IMU the first by
-    name. Without a transform to the right camera, the fourth column of its projection gives the baseline. Body is the
-    frame of the IMU, or of the first left camera.
+    The names of a pair's topics differ in one part only: ``left`` and ``right``, ``infra1`` and ``infra2``. Of several
+    topics with one camera's images one is used (see `preference`), and of several topics with IMU samples the first by
+    name. Without a transform to the right camera, the fourth column of its projection matrix gives the baseline. Body
+    is the frame of the IMU, or that of the first left camera.
 
     Raises:
         RigError: if transforms are missing, or a camera is of an unknown kind.
@@ -61,10 +61,10 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
 
 
 def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return name of each pair -> topics of its left and right camera.
+    """Return the stereo pairs among topics with images: name of the pair -> topics of its left and right camera.
 
-    Their names differ in one part only. Of several topics of a camera, such as raw and compressed or raw and rectified,
-    one is used: see `preference`.
+    The names of the two topics differ in one part only. Of several topics of a camera, such as raw and compressed or
+    raw and rectified, one is used: see `preference`.
     """
     names = sorted(name for name in images if not is_mask(name))
     made: dict[tuple[str, str], tuple[str, str]] = {}
@@ -84,20 +84,20 @@ def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def _without_side(camera: str) -> str:
-    """Return a pair's name: that of its left camera without the side."""
+    """Return a pair's name: the name of its left camera without the side."""
     parts = [part for part in camera.split("/") if part]
     others = [part for part in parts if not any(side in part for side in _WORDS)]
     return "-".join(others) or "-".join(parts)
 
 
 def info_topics(image_topic: str) -> list[str]:
-    """Return the possible topics of the calibration of a topic with images, the nearest first."""
+    """Return the topics that may have the calibration for a topic with images, the nearest name first."""
     parts = image_topic.split("/")
     return ["/".join([*parts[:depth], "camera_info"]) for depth in range(len(parts) - 1, 0, -1)]
 
 
 def _info(messages: MessageReader, image_topic: str) -> Any:
-    """Return the calibration of a topic with images, or None."""
+    """Return the ``CameraInfo`` for a topic with images, or None."""
     for name in info_topics(image_topic):
         topic = messages.topics.get(name)
         if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
@@ -110,7 +110,7 @@ def _first(messages: MessageReader, topic: Topic) -> Any:
     for place in topic.places[:-1]:
         try:
             return cdr.decode(messages.read(place), topic.type_name, messages.path)
-        except SessionError:  # the others say the same
+        except SessionError:  # the other messages have the same content
             continue
     return cdr.decode(messages.read(topic.places[-1]), topic.type_name, messages.path)
 
@@ -142,7 +142,7 @@ def _frame(info: Any, topic: str) -> str:
 
 
 def transforms_of(messages: MessageReader) -> dict[tuple[str, str], Float]:
-    """Return all static transforms: see `transforms_in`."""
+    """Return all static transforms of a recording, in the form of `transforms_in`."""
     made: dict[tuple[str, str], Float] = {}
     for topic in messages.topics.values():
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
@@ -153,7 +153,7 @@ def transforms_of(messages: MessageReader) -> dict[tuple[str, str], Float]:
 
 
 def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
-    """Return (parent, child) -> ``parent_T_child`` (4, 4) of a ``TFMessage``, and the inverses."""
+    """Return the transforms of a ``TFMessage`` and their inverses: (parent, child) -> ``parent_T_child`` (4, 4)."""
     made: dict[tuple[str, str], Float] = {}
     for each in message.transforms:
         pose = pose_of(each)

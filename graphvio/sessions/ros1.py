@@ -1,4 +1,4 @@
-"""Converts messages of ROS 1 from and to those of ROS 2: headers have a sequence number, and some names differ."""
+"""Conversion of ROS 1 messages from and to those of ROS 2: headers have a sequence number, and some names differ."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def modern(message: Any) -> Any:
 
 
 def encode(message: Any, number: int) -> bytes:
-    """Serialise a ROS 2 message as that of ROS 1, with its number in the topic for the headers."""
+    """Serialise a ROS 2 message as that of ROS 1; headers get ``number``, the message's number in its topic."""
     old = _old_log(message, number) if message.__msgtype__ == LOG else _old(message, number)
     return bytes(types().serialize_ros1(old, old.__msgtype__))
 

@@ -1,4 +1,4 @@
-"""Stamps of messages' headers, and comparison of their clock with the recorder's."""
+"""Reading of the stamps in messages' headers, and comparison of their clock with the recorder's."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _NS_PER_MS, _NS_PER_MINUTE = 1e6, 60e9
 class Clock:
     """Comparison of the stamps of one topic's headers with the times of recording."""
 
-    backward: int  # messages whose stamp is not after that of the message before
-    jumps: int  # messages whose stamp advanced a second or more differently from the recorder's clock
+    backward: int  # number of messages whose stamp is not after that of the previous message
+    jumps: int  # number of messages whose stamp advanced a second or more differently from the recorder's clock
     latency_ms: float  # median time from stamp to recording
     # growth of the latency; None if the recording is too short, or both clocks are the same
     drift_ms_per_minute: float | None
@@ -36,22 +36,22 @@ class Clock:
 class Offset:
     """Comparison of the stamps of two topics."""
 
-    matched: int  # messages of the first that have one of the second within half their interval
-    median_ms: float  # median of the second's stamp less the first's
+    matched: int  # number of messages of the first that have one of the second within half their median interval
+    median_ms: float  # median of the second's stamp minus the first's
     largest_ms: float  # largest absolute difference
 
 
 def header_stamps(store: Store, topic: Topic) -> Int:
     """Return the stamps (N,) of the headers of a topic's messages, in the order of the file.
 
-    graphvio's own sessions are logged by these stamps, and bags were read when they were opened; other files are read
-    here. A damaged message gets the time of its recording.
+    In graphvio's own sessions, the times of recording are these stamps, and bags were read when they were opened; other
+    files are read here. A damaged message gets the time of its recording.
     """
     return all_header_stamps(store, [topic])[topic.name]
 
 
 def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
-    """Return name of a topic -> its `header_stamps`, reading the file in order so that each chunk is unpacked once."""
+    """Return topic -> `header_stamps` of several topics; the file is read in order, to unpack each chunk only once."""
     found: dict[str, Int] = {}
     waiting: list[tuple[Place, str, int]] = []
     for topic in topics:
@@ -65,13 +65,13 @@ def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
     for place, name, row in sorted(waiting):
         try:
             found[name][row] = cdr.stamp_ns(store.read(place))
-        except SessionError:  # counted by those who read the message itself
+        except SessionError:  # counted where the message itself is read
             continue
     return found
 
 
 def compare_clocks(header_ns: Int, logged_ns: Int) -> Clock:
-    """Compare stamps (N,), N > 0, in the order of recording, with the times of recording (N,)."""
+    """Compare stamps of headers (N,), N > 0, in the order of recording, with the times of recording (N,)."""
     late_ns = logged_ns - header_ns
     drift, sigma = _drift(header_ns, late_ns)
     return Clock(
@@ -84,7 +84,7 @@ def compare_clocks(header_ns: Int, logged_ns: Int) -> Clock:
 
 
 def compare_topics(first_ns: Int, second_ns: Int) -> Offset | None:
-    """Compare stamps (N,) with the nearest ones (M,) of another topic; None if too few belong together."""
+    """Compare stamps (N,) with the nearest stamps of another topic (M,); None if too few belong together."""
     first, second = np.unique(first_ns), np.unique(second_ns)
     if len(first) < 2 or len(second) < 2:
         return None
@@ -98,7 +98,7 @@ def compare_topics(first_ns: Int, second_ns: Int) -> Offset | None:
 
 
 def _drift(header_ns: Int, late_ns: Int) -> tuple[float | None, float | None]:
-    """Slope of the latency and its standard deviation, ms per minute, by a line through medians of blocks."""
+    """Return the slope of the latency and its standard deviation, ms per minute, of a line through block medians."""
     if len(header_ns) < _MIN_MESSAGES or header_ns.max() - header_ns.min() < _MIN_DURATION_NS or not late_ns.any():
         return None, None
     blocks = np.array_split(np.argsort(header_ns, kind="stable"), _BLOCKS)

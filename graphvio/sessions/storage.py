@@ -1,4 +1,4 @@
-"""The interfaces of what writes recordings, and of the file formats to which a session is written."""
+"""The interfaces of writers of recordings, and of the file formats in which a session is written."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _log = logging.getLogger(__name__)
 
 
 class RecordingWriter(ABC):
-    """Writes the measurements of a source; a context manager that closes it.
+    """Base class of writers of a source's measurements; a context manager that closes the file or folder.
 
-    When the disk is full or nothing can be written any more, writing stops; this is logged, `stopped` says why, and
-    later calls do nothing.
+    When the disk is full or nothing can be written any more, writing stops; this is logged, `stopped` has the reason,
+    and later calls do nothing.
 
     Attributes:
-        path: of the file or folder.
-        rig: of the framesets, as written: without offsets of stamps, as those of framesets are corrected.
+        path: path of the file or folder.
+        rig: the rig of the framesets, as written: without stamp offsets, as the stamps of framesets are corrected.
         stopped: why writing stopped, or None.
     """
 
@@ -73,10 +73,10 @@ class RecordingWriter(ABC):
 
 
 class Storage(Protocol):
-    """A file or folder to which messages are written by topic; an `OSError` where it cannot be written.
+    """Interface of a file or folder to which messages are written by topic; methods raise `OSError` if that fails.
 
     Attributes:
-        path: of the file or folder.
+        path: path of the file or folder.
         has_attachments: whether it can hold texts in addition to messages.
         is_readable_when_cut: whether it can be read if its writing was not finished.
     """
@@ -89,7 +89,7 @@ class Storage(Protocol):
         """Store a text before all messages, if it `has_attachments`."""
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a ROS 2 message of rosbags' types; late subscribers still get the last one of a latched topic."""
+        """Store a ROS 2 message of rosbags' types; late subscribers still get the last message of a latched topic."""
 
     def finish(self) -> None:
         """Write the end of the file."""
@@ -99,10 +99,10 @@ class Storage(Protocol):
 
 
 def exists_error(path: Path) -> SessionError:
-    """Return the error that a session would be overwritten."""
+    """Return the error for a session that would be overwritten."""
     return SessionError(f"{path}: exists, and sessions are never overwritten; name another file")
 
 
 def not_writable_error(path: Path, error: OSError) -> SessionError:
-    """Return the error that a session cannot be created."""
+    """Return the error for a session that cannot be created."""
     return SessionError(f"{path}: cannot be written ({error.strerror}); choose another place")

@@ -1,4 +1,4 @@
-"""Sessions and bags, whatever their file format."""
+"""Opening of sessions and bags of any file format."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from graphvio.sessions.topics import Store
 
 SUFFIXES = (".mcap", ".bag", ".db3")
-"""Of files that are sessions or bags by themselves: MCAP, ROS 1, and ROS 2 with SQLite."""
+"""Suffixes of files that are sessions or bags by themselves: MCAP, ROS 1, and ROS 2 with SQLite."""
 
 
 def is_store(path: Path) -> bool:
@@ -20,8 +20,8 @@ def open_store(path: Path, is_wanted: Callable[[str], bool] = lambda topic: True
     """Open a session or bag.
 
     Args:
-        path: of the file, or of the folder of a ROS 2 bag.
-        is_wanted: whether a topic of a bag is read; fewer topics take less time.
+        path: path of the file, or of the folder of a ROS 2 bag.
+        is_wanted: returns whether a topic of a bag is read; fewer topics take less time.
 
     Raises:
         SessionError: if it cannot be read.

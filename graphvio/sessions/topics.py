@@ -1,4 +1,4 @@
-"""Topics of sessions and bags: their names, their messages, and which of several to use."""
+"""Topics of sessions and bags: their names, their messages, and the choice among several."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graphvio.rig import CameraGroup, StereoPair
 ImageFormat = Literal["raw", "png"]
 RIG_ATTACHMENT = "rig.yaml"
 RIG_TOPIC = "/graphvio/rig"
-"""Has the text of ``rig.yaml`` in files without attachments."""
+"""Topic with the text of ``rig.yaml`` in files without attachments."""
 IMU_TOPIC, TRANSFORMS_TOPIC, ODOMETRY_TOPIC, LOG_TOPIC = "/imu", "/tf_static", "/odometry", "/rosout"
 TRUTH_TOPIC = "/ground_truth"
 _MASK = "mask"
@@ -25,8 +25,8 @@ _MASK = "mask"
 class Place(NamedTuple):
     """Position of a message in a file."""
 
-    chunk: int  # byte of the file at which the message's chunk begins, -1 if it is in none; of bags, the connection
-    offset: int  # byte of the message in the unpacked chunk, or in the file; of bags, its row or time
+    chunk: int  # byte of the file at which the message's chunk begins, -1 if it is in none; for bags, the connection
+    offset: int  # byte of the message in the unpacked chunk, or in the file; for bags, its row or time
     channel: int = -1  # number of the message's channel, -1 if unknown
     logged_ns: int = -1  # time of its recording, -1 if unknown
 
@@ -35,11 +35,11 @@ class Place(NamedTuple):
 class Topic:
     """Messages of one topic, in the order of the file."""
 
-    name: str  # such as ``/imu``
-    type_name: str  # such as ``sensor_msgs/msg/Imu``
+    name: str  # name of the topic, such as ``/imu``
+    type_name: str  # type of its messages, such as ``sensor_msgs/msg/Imu``
     logged_ns: list[int] = field(default_factory=list)  # time of recording of each message
     places: list[Place] = field(default_factory=list)  # position of each message
-    # stamps of their headers if the reader decodes them, otherwise empty
+    # stamps of the messages' headers if the reader decodes them, otherwise empty
     header_ns: list[int] = field(default_factory=list)
 
     @property
@@ -49,9 +49,9 @@ class Topic:
 
 
 class MessageReader(Protocol):
-    """Messages by topic, of a file or of a running system."""
+    """Interface to messages by topic, of a file or of a running system."""
 
-    path: Path  # the file, or a name for messages
+    path: Path  # path of the file, or a name for error messages
     topics: dict[str, Topic]
 
     def read(self, place: Place) -> bytes:
@@ -63,7 +63,7 @@ class MessageReader(Protocol):
 
 
 def sides_of(group: CameraGroup) -> tuple[str, ...]:
-    """Return what the topics of a group's cameras are called: left and right, or mono."""
+    """Return the parts of topic names that stand for a group's cameras: left and right, or mono."""
     return ("left", "right") if isinstance(group, StereoPair) else ("mono",)
 
 
@@ -78,17 +78,17 @@ def mask_topic(pair: str, side: str, image_format: ImageFormat) -> str:
 
 
 def is_mask(topic: str) -> bool:
-    """Return whether a topic has masks, by its name: ``mask`` is its last part, but for ``compressed``."""
+    """Return whether a topic has masks, judging by its name: ``mask`` is one of its last two parts."""
     return _MASK in topic.split("/")[-2:]
 
 
 def of_type(topics: Mapping[str, Topic], *type_names: str) -> list[Topic]:
-    """Return the topics of the given types that have messages, by name."""
+    """Return the topics of the given types that have messages, sorted by name."""
     return [topic for _, topic in sorted(topics.items()) if topic.type_name in type_names and topic.places]
 
 
 def preference(topic: str) -> tuple[int, bool, str]:
-    """Return a key that is least for the topic to use of several with one camera's images.
+    """Return a sort key that is smallest for the topic to use among several with one camera's images.
 
     Images that D and K of ``camera_info`` describe come first, then raw before compressed ones.
     """
@@ -104,7 +104,7 @@ def preference(topic: str) -> tuple[int, bool, str]:
 
 
 def camera_of(topic: str, sides: tuple[str, ...]) -> str:
-    """Return the common beginning of the topics with one camera's images: all before ``image_raw`` and the like.
+    """Return the common beginning of the topics with one camera's images: the parts before ``image_raw`` or similar.
 
     If a word of ``sides`` is in the last part, as in ``image_left``, that part is kept.
     """
@@ -120,16 +120,16 @@ def _is_compressed(parts: list[str]) -> bool:
 
 
 class Store(ABC):
-    """A session or bag, for any number of threads; a `graphvio.sessions.topics.MessageReader`."""
+    """Base class of an open session or bag, for any number of threads; a `MessageReader`."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path  # of the file, or of the folder of a ROS 2 bag
-        self.topics: dict[str, Topic] = {}  # by name
-        self.library = ""  # that wrote it; empty for bags
-        self.attachments: dict[str, bytes] = {}  # by name; none in bags
+        self.path = path  # path of the file, or of the folder of a ROS 2 bag
+        self.topics: dict[str, Topic] = {}  # name -> topic
+        self.library = ""  # name of the library that wrote it; empty for bags
+        self.attachments: dict[str, bytes] = {}  # name -> content; none in bags
         self.is_whole = True  # whether its writing was finished
         self.damages: list[str] = []  # one line for each record that cannot be used
-        self.has_damaged_attachment = False  # whether an attachment is among them
+        self.has_damaged_attachment = False  # whether an attachment is among these
 
     @abstractmethod
     def read(self, place: Place) -> bytes:
@@ -141,5 +141,5 @@ class Store(ABC):
 
     @property
     def damaged_chunks(self) -> int:
-        """How many of the chunks that have been read so far are damaged; bags have none."""
+        """Number of damaged chunks among those that have been read so far; bags have none."""
         return 0

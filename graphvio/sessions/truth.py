@@ -1,4 +1,4 @@
-"""Reads trajectories in a session or bag: the true one, or that of any topic with poses."""
+"""Reading of trajectories in a session or bag: the true one, or that of any topic with poses."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def read_poses(path: Path, topic: str | None = None) -> tuple[Int, Float]:
     """Return stamps (N,), increasing, and poses ``world_T_body`` (N, 4, 4) of a topic.
 
     Args:
-        path: session or bag.
-        topic: with poses, an odometry or transforms; None takes the true trajectory, or the only such topic.
+        path: path of the session or bag.
+        topic: topic with poses, an odometry or transforms; None takes the true trajectory, or the only such topic.
 
     Raises:
-        TrajectoryError: if it holds none, or several and no true one.
-        SessionError: if it cannot be read.
+        TrajectoryError: if there is no such topic, or there are several and no true trajectory.
+        SessionError: if the session or bag cannot be read.
     """
     wanted = TRUTH_TOPIC if topic is None else topic
     store = open_store(path, lambda each: each == wanted)
@@ -62,7 +62,11 @@ def read_poses(path: Path, topic: str | None = None) -> tuple[Int, Float]:
 
 
 def _only_topic(path: Path, found: Sequence[Topic], asked: str | None) -> Topic:
-    """Return the topic to take where there is no true trajectory, or where the one asked for has no poses."""
+    """Return the only topic with poses, where there is no true trajectory.
+
+    Raises:
+        TrajectoryError: if there is none or there are several, or if a topic without poses was asked for.
+    """
     names = ", ".join(each.name for each in found) or "none"
     if asked is not None:
         raise TrajectoryError(f"{path}: has no poses on {asked}; topics with poses: {names}")

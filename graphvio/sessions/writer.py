@@ -1,4 +1,4 @@
-"""Records a session: measurements, estimates and events as messages."""
+"""Writer of sessions: measurements, estimates and events as messages."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class SessionWriter(RecordingWriter):
     """Writes measurements, estimates, the true trajectory and events.
 
     Args:
-        path: of the file or folder, which must not exist.
-        rig: of the framesets; is written into the file, without offsets of stamps, which are corrected in framesets.
+        path: path of the file or folder, which must not exist.
+        rig: the rig of the framesets, which is written into the file without stamp offsets: framesets are corrected.
         image_format: raw, or PNG, which is smaller and slower.
         storage: creates the file or folder: MCAP, which loses at most the last second in a crash, or a bag.
 
@@ -97,7 +97,7 @@ class SessionWriter(RecordingWriter):
         self._guarded(lambda: self._add(TRUTH_TOPIC, stamp_ns, message))
 
     def add_event(self, event: Event) -> None:
-        """Record an event; if it is not within the recording's time, at the nearer end of that."""
+        """Record an event; if its stamp is outside of the recording's time, with the nearer end of that as stamp."""
         if self._first_ns is not None:
             stamp_ns = min(max(event.stamp_ns, self._first_ns), self._last_ns)
             event = Event(stamp_ns, event.kind, event.detail)

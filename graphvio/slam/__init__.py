@@ -1,4 +1,4 @@
-"""The odometry as the front-end of a SLAM system: keyframes out, global corrections in."""
+"""The odometry as the front-end of a SLAM system, which gets keyframes from it and returns global corrections."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ __all__ = ["FrontEnd"]
 
 
 def __getattr__(name: str) -> object:
-    # Loaded when it is first used: a client of another process needs no odometry.
+    # Loaded when it is first used: a client of an odometry in another process does not need this module.
     if name != "FrontEnd":
         raise AttributeError(f"module 'graphvio.slam' has no attribute {name!r}")
     from graphvio.slam.front_end import FrontEnd

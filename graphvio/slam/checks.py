@@ -1,4 +1,4 @@
-"""Checks of what corrections consist of: the pose of a keyframe in the map, and its covariance."""
+"""Checks of the parts of a correction: the pose of a keyframe in the map, and its covariance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from graphvio.arrays import Float
 from graphvio.errors import MeasurementError
 
 _MAX_RIGID_ERROR = 1e-6
-_MAX_ASYMMETRY = 1e-6  # of the largest value: numbers of single precision
+_MAX_ASYMMETRY = 1e-6  # relative to the largest value: that of single-precision numbers
 
 
 def check_pose(matrix: Float, what: str) -> None:

@@ -1,4 +1,4 @@
-"""The client of an odometry that is served over gRPC by another process; needs the extra ``serve``."""
+"""Client of an odometry that another process serves over gRPC; needs the extra ``serve``."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Update(Generic[S]):
 
 
 class Client:
-    """A `graphvio.slam.interface.SlamFrontEnd` over gRPC; a context manager, thread-safe.
+    """Implementation of `graphvio.slam.interface.SlamFrontEnd` over gRPC; a context manager, thread-safe.
 
     Args:
         address: ``HOST:PORT``, or ``HOST`` with the default port.
@@ -119,7 +119,7 @@ class Client:
     ) -> Iterator[Keyframe]:
         """Yield keyframes as they come until the odometry has ended.
 
-        After a lost connection it reconnects, and goes on with the next keyframe.
+        After a lost connection, the client reconnects and continues with the next keyframe.
 
         Args:
             from_id: Id of the first keyframe. Ids that are skipped were no longer kept.
@@ -164,17 +164,17 @@ class Client:
             yield Event(update.stamp_ns, update.kind, update.detail)
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Correct where a keyframe is in the map, see `SlamFrontEnd.correct`.
+        """Correct the pose of a keyframe in the map, see `SlamFrontEnd.correct`.
 
-        It is not repeated after a lost connection: whether it arrived is then unknown.
+        The call is not repeated after a lost connection: whether the correction arrived is then unknown.
 
         Args:
-            keyframe_id: of the keyframe.
-            map_T_body: (4, 4) its pose in the map.
-            covariance: (6, 6) of that pose, rotation first, in body.
+            keyframe_id: Id of the keyframe.
+            map_T_body: (4, 4) pose of body in the map.
+            covariance: (6, 6) covariance of that pose, tangent ``[rotation, translation]`` in body.
 
         Returns:
-            Whether the correction was accepted, and why not.
+            Whether the correction was accepted, and if not, why.
 
         Raises:
             ServiceError: Also if the correction is malformed, or the server meanwhile serves another run.

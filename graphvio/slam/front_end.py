@@ -1,4 +1,4 @@
-"""The odometry as the front-end of a SLAM system in the same process: keyframes out, corrections in."""
+"""The odometry as the front-end of a SLAM system in the same process: it gives keyframes and takes corrections."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from graphvio.slam.map_frame import MapFrame
 
 
 class FrontEnd:
-    """Keyframes of a running odometry, and the map frame that a SLAM system corrects.
+    """Makes keyframes of a running odometry, and keeps the map frame that a SLAM system corrects.
 
     It subscribes to the odometry's steps, and never changes its results. It implements
     `graphvio.slam.interface.SlamFrontEnd`, as does `graphvio.slam.client.Client` for an odometry in another process.
 
     Args:
-        odometry: Feed it as usual; its configuration has the keyframes' settings.
+        odometry: The odometry, which is fed as usual; its configuration has the keyframes' settings.
 
     Attributes:
         log: The newest keyframes; empty until keyframes are requested.
@@ -51,19 +51,19 @@ class FrontEnd:
     # ------------------------------------------------------------------ keyframes out
 
     def on_keyframe(self, callback: Callable[[Keyframe], None]) -> None:
-        """Hand each keyframe from now on to a callback.
+        """Pass each keyframe from now on to a callback.
 
         Args:
-            callback: called within `Odometry.process`: it should return soon.
+            callback: Function that is called within `Odometry.process`, and should return soon.
         """
         self._is_wanted = True
         self._callbacks.append(callback)
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
-        """Yield keyframes until the odometry is finished, see `SlamFrontEnd.keyframes`; for a thread of its own.
+        """Yield keyframes until the odometry is finished, see `SlamFrontEnd.keyframes`; call it in another thread.
 
         Args:
-            from_id: the first that is wanted.
+            from_id: Id of the first keyframe.
         """
         self._is_wanted = True
         return self.log.follow(from_id)
@@ -77,12 +77,12 @@ class FrontEnd:
     # ------------------------------------------------------------------ corrections in
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Correct where a keyframe is in the map, which moves `map_T_odom` and nothing else; thread-safe.
+        """Correct the pose of a keyframe in the map, which changes `map_T_odom` and nothing else; thread-safe.
 
         Args:
             keyframe_id: Id of a keyframe of this epoch, however old: the correction is carried forward.
             map_T_body: (4, 4) pose of body in the map.
-            covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+            covariance: (6, 6) covariance of that pose, tangent ``[rotation, translation]`` in body.
 
         Returns:
             Whether it was accepted. A correction far from the expected one fails the innovation test and is reported,
@@ -99,17 +99,17 @@ class FrontEnd:
 
     @property
     def map_T_odom(self) -> Float | None:
-        """(4, 4) of the newest epoch's odom frame, which is nav, in the map (REP-105), or None before a correction."""
+        """Pose (4, 4) in the map of the newest epoch's odom frame, which is nav (REP-105); None before a correction."""
         return self._map_frame.map_T_odom
 
     def map_T_body(self, stamp_ns: int) -> Float | None:
-        """Predict the pose in the map.
+        """Predict the pose in the map at a stamp.
 
         Args:
-            stamp_ns: when, nanoseconds of the camera clock.
+            stamp_ns: Stamp in nanoseconds of the camera clock.
 
         Returns:
-            ``map_T_body`` (4, 4), or None where `Odometry.predict` has none, or the map is not known.
+            ``map_T_body`` (4, 4), or None where `Odometry.predict` returns None or ``map_T_odom`` is not known.
         """
         prediction = self._odometry.predict(stamp_ns)
         map_T_odom = None if prediction is None else self._map_frame.of_epoch(prediction.epoch)
@@ -152,7 +152,7 @@ class FrontEnd:
             callback(keyframe)
 
     def _motion_since(self, previous: Keyframe, estimate: Estimate, new: NewKeyframe) -> tuple[Float, Float]:
-        """Return the motion since the keyframe before and its covariance."""
+        """Return the motion (4, 4) since the previous keyframe and its covariance (6, 6)."""
         assert estimate.nav_T_body is not None
         assert estimate.covariance is not None
         is_successive = previous.stamp_ns == new.previous_ns

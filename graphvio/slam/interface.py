@@ -15,7 +15,7 @@ from graphvio.slam.keyframe_log import KeyframeLog
 
 
 class SlamFrontEnd(Protocol):
-    """Keyframes out, corrections in.
+    """Interface of the odometry to a SLAM system: it gives keyframes and takes corrections.
 
     `graphvio.slam.FrontEnd` implements it for an odometry in the same process, `graphvio.slam.client.Client` for one in
     another process.
@@ -33,26 +33,26 @@ class SlamFrontEnd(Protocol):
         """
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Correct where a keyframe is in the map.
+        """Correct the pose of a keyframe in the map.
 
         Args:
             keyframe_id: Id of a keyframe of the newest epoch.
             map_T_body: (4, 4) pose of body in the map.
-            covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+            covariance: (6, 6) covariance of that pose, tangent ``[rotation, translation]`` in body.
 
         Returns:
-            Whether it was accepted.
+            Whether the correction was accepted.
         """
 
 
 class Served(Protocol):
-    """A running odometry as the services see it; its threads never wait for subscribers.
+    """Interface of a running odometry to the services; its threads never wait for subscribers.
 
     Attributes:
         rig: Cameras and IMU.
-        estimates: Estimates of the framesets.
-        predictions: Predictions at each sample of the IMU.
-        events: Events of the run.
+        estimates: Broadcast of the estimates of the framesets.
+        predictions: Broadcast of the predictions at each sample of the IMU.
+        events: Broadcast of the events of the run.
         keyframe_log: The newest keyframes; closed when the odometry has ended.
     """
 
@@ -64,7 +64,7 @@ class Served(Protocol):
 
     @property
     def map_T_odom(self) -> Float | None:
-        """Correction in force, (4, 4), or None before the epoch's first."""
+        """Correction in force (4, 4), or None before the first correction of the epoch."""
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
         """See `SlamFrontEnd.correct`; thread-safe."""
@@ -77,7 +77,7 @@ def newest_epoch(served: Served) -> int | None:
     """Return the epoch of the newest keyframe, or None before the first.
 
     Args:
-        served: the odometry.
+        served: The odometry.
     """
     log = served.keyframe_log
     newest = log.read(max(log.next_id - 1, 0), timeout_s=0.0)
@@ -85,11 +85,11 @@ def newest_epoch(served: Served) -> int | None:
 
 
 def map_of_epoch(served: Served, epoch: int) -> Float | None:
-    """Return ``map_T_odom`` (4, 4) in force; None if the odometry is in another epoch by now.
+    """Return the ``map_T_odom`` (4, 4) in force; None if there is none, or the odometry is in another epoch by now.
 
     Args:
-        served: the odometry.
-        epoch: in which the transform is wanted.
+        served: The odometry.
+        epoch: The epoch of whose odom frame the transform is wanted.
     """
     before = newest_epoch(served)
     map_T_odom = served.map_T_odom

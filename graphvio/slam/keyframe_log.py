@@ -51,7 +51,7 @@ class KeyframeLog:
             self._changed.notify_all()
 
     def read(self, from_id: int, timeout_s: float | None = None) -> Keyframe | None:
-        """Wait for the first keyframe that is kept, from an id on; None after the timeout, or where none will come."""
+        """Wait for and return the first kept keyframe from an id on; None after the timeout, or if none will come."""
         with self._changed:
             self._changed.wait_for(lambda: self._next_id > from_id or self.is_closed, timeout_s)
             if self._next_id <= from_id or not self._kept:

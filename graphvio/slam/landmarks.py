@@ -19,17 +19,17 @@ from graphvio.slam.keyframe import Landmarks
 Describe = Callable[[Image, Float], AnyArray]
 """Computes the descriptors (N, D), uint8, of an image at pixels (N, 2)."""
 
-_MIN_DEPTH_SIGMAS = 3.0  # a more uncertain depth has no covariance in metres
-_RADIUS = 15  # of ORB's patch
-_BORDER_PX = 40  # added, so that no corner is too near to the edge of the image
+_MIN_DEPTH_SIGMAS = 3.0  # a more uncertain inverse depth has no meaningful covariance in metres
+_RADIUS = 15  # radius of ORB's patch, pixels
+_BORDER_PX = 40  # border added to images, so that no corner is too near to the edge
 _SIFT_SIZE_PX = 7.0
 _NOWHERE = LocatedPoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
 def landmarks_of(rig: Rig, keyframe: NewKeyframe, pixel_sigma_px: float, describe: Describe | None) -> Landmarks:
-    """Return the tracks whose inverse depth exceeds three standard deviations.
+    """Return landmarks of the tracks whose inverse depth exceeds three standard deviations.
 
-    Those of single cameras are where the state has them, if it locates points, or where the front-end does.
+    In a rig without pairs, landmarks are instead the points that the state of single cameras has located.
 
     Args:
         rig: The rig, with the calibration that is in force.
@@ -59,7 +59,7 @@ def landmarks_of(rig: Rig, keyframe: NewKeyframe, pixel_sigma_px: float, describ
 
 
 def _located(frame: TrackedFrame, body_T_left: Float, pixel_sigma_px: float) -> tuple[TrackedFrame, Float, Float]:
-    """Return the tracks of known depth, and their places (N, 3) in body with covariances, by the front-end."""
+    """Return the tracks of known depth, and the front-end's points (N, 3) in body with covariances (N, 3, 3)."""
     sigma_w = pixel_sigma_px * np.sqrt(frame.covariances[:, 2, 2])
     frame = frame.keep(frame.has_depth & (frame.points[:, 2] > _MIN_DEPTH_SIGMAS * sigma_w))
     n = len(frame.ids)

@@ -1,9 +1,9 @@
-"""The odometry's frame in a map (REP-105), estimated from corrections of single keyframes.
+"""Estimation of the odometry's frame in a map (REP-105) from corrections of single keyframes.
 
 The state is ``map_T_odom``, a random walk whose process noise is the odometry's drift between keyframes; a correction
-measures it at its keyframe. All covariances are expressed in the tangent in odom, where they add up. A Kalman filter
-fuses corrections in the order of their keyframes, and is run again over all of them when one comes late. Corrections
-are assumed to be independent of each other.
+measures the state at its keyframe. All covariances are expressed in the tangent in odom, where they add up. A Kalman
+filter fuses corrections in the order of their keyframes, and is run again over all of them when one comes late.
+Corrections are assumed to be independent of each other.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.slam.checks import check_covariance, check_pose
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 
-_MAX_KEYFRAMES = 10_000  # that can be corrected; about an hour
-_MAX_CORRECTIONS = 200  # that are fused again when one comes late
+_MAX_KEYFRAMES = 10_000  # keyframes that can be corrected; those of about an hour
+_MAX_CORRECTIONS = 200  # corrections that are fused again when one comes late
 _FIRST_AGREEMENT = 3  # refused corrections in a row that must agree to be accepted; doubled each time
 
 
 @dataclass(frozen=True, eq=False)
 class _Passed:
-    """A past keyframe: its pose, and the covariance (6, 6) of the drift up to it, tangent in odom."""
+    """A past keyframe: its pose (4, 4), and the covariance (6, 6) of the drift up to it, tangent in odom."""
 
     odom_T_body: Float
     drift: Float
@@ -36,7 +36,7 @@ class _Passed:
 
 @dataclass(frozen=True, eq=False)
 class _Correction:
-    """``map_T_odom`` by one correction, or by several fused ones."""
+    """An estimate of ``map_T_odom`` at a keyframe from one correction, or from several fused ones."""
 
     epoch: int  # epoch of the keyframe
     keyframe_id: int  # id of the keyframe
@@ -49,7 +49,7 @@ class _Correction:
 class MapFrame:
     """Estimator of ``map_T_odom`` in the newest epoch; thread-safe.
 
-    Corrections beyond a share of the chi-square distribution, the probability, are refused.
+    Corrections beyond the quantile of the chi-square distribution at ``probability`` are refused.
     """
 
     def __init__(self, probability: float) -> None:
@@ -58,13 +58,13 @@ class MapFrame:
         self._epoch: int | None = None
         self._passed: dict[int, _Passed] = {}
         self._accepted: list[_Correction] = []  # in the order of keyframes
-        self._refused: list[_Correction] = []  # since the last one that was accepted, the newest of each keyframe
+        self._refused: list[_Correction] = []  # since the last accepted one, the newest of each keyframe
         self._agreement = _FIRST_AGREEMENT
-        self._estimate: _Correction | None = None  # all accepted ones fused, at the last one's keyframe
+        self._estimate: _Correction | None = None  # all accepted corrections fused, at the last one's keyframe
 
     @property
     def map_T_odom(self) -> Float | None:
-        """(4, 4), or None before the epoch's first correction."""
+        """Estimate (4, 4), or None before the epoch's first correction."""
         estimate = self._estimate
         return None if estimate is None else estimate.map_T_odom.copy()
 
@@ -94,11 +94,11 @@ class MapFrame:
                 del self._passed[next(iter(self._passed))]
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Fuse a correction of where a keyframe is in the map, or refuse it.
+        """Fuse a correction of a keyframe's pose in the map, or refuse it.
 
         A correction that fails the innovation test is refused, until several refused ones in a row agree with each
-        other. Each time this takes twice as many, so that two contradicting sources do not alternate. A second
-        correction of a keyframe replaces the first.
+        other. Each time this happens, twice as many are required for the next time, so that two contradicting sources
+        do not alternate. A second correction of a keyframe replaces the first.
 
         Raises:
             MeasurementError: If the pose is not rigid, or the covariance is not positive definite.
@@ -147,7 +147,7 @@ class MapFrame:
             self._estimate = _fused(self._accepted)
         else:
             self._estimate = _fused([estimate, candidate])
-        if len(self._accepted) > _MAX_CORRECTIONS:  # the older half becomes one
+        if len(self._accepted) > _MAX_CORRECTIONS:  # the older half is fused into one
             half = self._accepted[: _MAX_CORRECTIONS // 2]
             self._accepted = [replace(_fused(half), is_many=True), *self._accepted[len(half) :]]
         return CorrectionResult(True, reason, statistic, self._threshold, self.map_T_odom)
@@ -156,7 +156,7 @@ class MapFrame:
         return CorrectionResult(False, reason, statistic, self._threshold, self.map_T_odom)
 
     def _expected_at(self, candidate: _Correction) -> _Correction:
-        """Return the accepted corrections fused at the keyframe of a candidate."""
+        """Return the accepted corrections, fused and carried to the keyframe of a candidate."""
         assert self._estimate is not None
         if self._estimate.keyframe_id <= candidate.keyframe_id:
             return _carried(self._estimate, candidate)
@@ -182,12 +182,12 @@ def _fused(corrections: Sequence[_Correction]) -> _Correction:
 
 
 def _carried(estimate: _Correction, to: _Correction) -> _Correction:
-    """Return an estimate at another keyframe."""
+    """Return an estimate carried to another keyframe, with the drift in between added to its covariance."""
     return replace(to, map_T_odom=estimate.map_T_odom, covariance=estimate.covariance + _drift(estimate, to))
 
 
 def _distance(one: _Correction, other: _Correction) -> float:
-    """Return the squared Mahalanobis distance."""
+    """Return the squared Mahalanobis distance between two independent estimates, 6 degrees of freedom."""
     difference = _difference(one, other)
     covariance = one.covariance + other.covariance + _drift(one, other)
     return float(difference @ np.linalg.solve(covariance, difference))
@@ -202,8 +202,8 @@ def _drift(one: _Correction, other: _Correction) -> Float:
 def _drifted(odom_T_previous: Float, keyframe: Keyframe) -> Float:
     """Return the covariance (6, 6) of the drift since the previous keyframe, tangent in odom.
 
-    Poses in odom are causal: the smoother's later correction of the previous keyframe moves odom. It is no part of the
-    relative covariance, and often larger.
+    Poses in odom are causal: when the smoother later corrects the previous keyframe, odom moves. The relative
+    covariance does not include this motion, which is often larger.
     """
     if keyframe.previous_T_body is None or keyframe.relative_covariance is None:
         return np.zeros((6, 6))

@@ -1,4 +1,4 @@
-"""Recordings as streams of IMU samples and framesets: EuRoC/ASL, TUM-VI, KITTI odometry and raw, sessions (MCAP)."""
+"""Reading of recordings as IMU samples and framesets: EuRoC/ASL, TUM-VI, KITTI odometry and raw, sessions (MCAP)."""
 
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index

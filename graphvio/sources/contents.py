@@ -1,4 +1,4 @@
-"""Describes the recording in a folder: its rig, its cameras and IMU, how regular they are, and what is wrong."""
+"""Description of the recording in a folder: its rig, its cameras and IMU, their regularity, and faults."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from graphvio.sources.recording import Source
 
 @dataclass(frozen=True)
 class SensorDescription:
-    """Images of a camera, or samples of the IMU."""
+    """Description of a camera's images, or of the IMU's samples."""
 
-    name: str  # of the camera, or ``imu``
-    count: int  # of images or samples
-    regularity: Regularity | None  # of their stamps, or None if there are too few
+    name: str  # name of the camera, or ``imu``
+    count: int  # number of images or samples
+    regularity: Regularity | None  # regularity of their stamps, or None if there are too few
     size_px: tuple[int, int] | None = None  # width and height of the first image, or None if it cannot be read
 
 
@@ -34,27 +34,27 @@ class SensorDescription:
 class FolderDescription:
     """Description of a recording in a folder."""
 
-    path: Path  # of the folder
+    path: Path  # path of the folder
     layout: str  # name of its layout, such as ``EuRoC/ASL and TUM-VI``
-    duration_s: float  # from the first to the last frameset
-    framesets: int  # how many
-    rate_hz: float | None  # of the framesets by their median interval, or None if there are too few
+    duration_s: float  # time from the first to the last frameset
+    framesets: int  # number of framesets
+    rate_hz: float | None  # rate of the framesets from their median interval, or None if there are too few
     rig: str  # one line about the calibration
     sensors: tuple[SensorDescription, ...]  # the rig's cameras, then the IMU
     truth: Path | None  # file of the true trajectory, or None
-    faults: Mapping[str, int]  # kind of event -> count ; of each camera only the first image is decoded
+    faults: Mapping[str, int]  # kind of event -> count; only the first image of each camera is decoded
 
 
 def describe_folder(path: Path, rig: Path | None = None) -> FolderDescription:
     """Describe a recording in a folder; of each camera one image is decoded.
 
     Args:
-        path: of the folder.
-        rig: calibration file, or None for what the recording carries.
+        path: path of the folder.
+        rig: calibration file, or None for the recording's own calibration.
 
     Raises:
-        SourceError: if it has no known layout, cannot be read, or holds nothing.
-        RigError: if the calibration is not usable, is of images of another size, or there is none.
+        SourceError: if the folder has no known layout, cannot be read, or holds nothing.
+        RigError: if the calibration is not usable, is for images of another size, or there is none.
     """
     used = None if rig is None else load_rig(rig)
     with reading(path, SourceError, "check its permissions"):
@@ -82,7 +82,7 @@ def _described(path: Path, rig: Rig | None) -> FolderDescription:
 
 
 def _camera(camera: Camera, images: ImageSequence, path: Path, faults: FaultLog) -> SensorDescription:
-    """Describe the images of a camera; those that it lists and that are not there are faults."""
+    """Describe the images of a camera; images that are listed but do not exist are added to the faults."""
     if isinstance(images, ImageFiles):
         absent = [row for row, name in enumerate(images.names) if not (images.folder / name).is_file()]
         if absent:

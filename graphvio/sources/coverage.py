@@ -1,4 +1,4 @@
-"""Faults of a recording that its index shows: images without partner, missing pairs, and gaps."""
+"""Detection of faults in a recording's index: images without partner, missing pairs, and gaps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _IMU_GAP_PERIODS = 5.0
 
 
 def count_image_faults(rig: Rig, pairs: Sequence[PairIndex], framesets: FramesetIndex, faults: FaultLog) -> None:
-    """Count images without partner or with several, framesets without a pair, and gaps, in the framesets' time."""
+    """Count images with no or several partners, framesets that lack a pair, and gaps, from first to last frameset."""
     begin_ns, end_ns = int(framesets.stamps_ns[0]), int(framesets.stamps_ns[-1])
     gaps: list[tuple[int, int, str]] = []
     for number, (pair, index) in enumerate(zip(rig.groups, pairs, strict=True)):
@@ -38,7 +38,7 @@ def count_image_faults(rig: Rig, pairs: Sequence[PairIndex], framesets: Frameset
                 EventKind.PAIRING_AMBIGUOUS, int(ambiguous[0]), f"{detail}; the nearest are taken", len(ambiguous)
             )
         absent = framesets.stamps_ns[framesets.rows[:, number, 0] < 0]
-        absent = absent[_far_from(absent, index.stamps_ns, _ABSENT_PERIODS)]  # not if triggered at another time
+        absent = absent[_far_from(absent, index.stamps_ns, _ABSENT_PERIODS)]  # not pairs triggered at another time
         if len(absent):
             detail = f"{pair.name} has no images at {absent[0]}, others have"
             faults.add(EventKind.FRAMESET_INCOMPLETE, int(absent[0]), detail, len(absent))
@@ -53,7 +53,7 @@ def count_image_faults(rig: Rig, pairs: Sequence[PairIndex], framesets: Frameset
 
 
 def count_imu_faults(stamps_ns: Int, begin_ns: int, end_ns: int, faults: FaultLog) -> None:
-    """Count gaps of the IMU's samples (N,), N > 0, and whether they begin late or stop early; on the IMU's clock."""
+    """Count gaps in the stamps (N,), N > 0, of the IMU, and a late begin or early end; all on the IMU's clock."""
     period = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0
     if stamps_ns[0] > begin_ns + period:
         detail = f"the first sample comes {_ms(int(stamps_ns[0]) - begin_ns)} after the first frameset"
@@ -66,7 +66,7 @@ def count_imu_faults(stamps_ns: Int, begin_ns: int, end_ns: int, faults: FaultLo
 
 
 def _gaps(stamps_ns: Int, periods: float) -> list[tuple[int, int]]:
-    """Stamps before and after each gap of more than so many median periods."""
+    """Return the stamps before and after each gap that is longer than ``periods`` median periods."""
     steps = np.diff(stamps_ns)
     if not len(steps):
         return []
@@ -75,7 +75,7 @@ def _gaps(stamps_ns: Int, periods: float) -> list[tuple[int, int]]:
 
 
 def _far_from(stamps_ns: Int, own_ns: Int, periods: float) -> Bool:
-    """Which stamps (N,) are more than so many median periods from all of a pair's own (M,), which increase."""
+    """Return which stamps (N,) are more than ``periods`` median periods from all of a pair's own (M,), increasing."""
     if len(own_ns) < 2:
         return ~np.isin(stamps_ns, own_ns)
     after = np.clip(np.searchsorted(own_ns, stamps_ns), 1, len(own_ns) - 1)

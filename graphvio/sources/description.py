@@ -1,4 +1,4 @@
-"""Describes a session or bag: its topics, how regular their messages are, and how its clocks compare."""
+"""Description of a session or bag: its topics, the regularity of their messages, and a comparison of clocks."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _NS_PER_MS, _NS_PER_S = 1e6, 1e9
 
 @dataclass(frozen=True)
 class Regularity:
-    """Intervals between stamps."""
+    """Statistics of the intervals between stamps."""
 
-    rate_hz: float | None  # by the median interval; None if that is zero
+    rate_hz: float | None  # rate from the median interval; None if that is zero
     jitter_ms: float  # standard deviation of the intervals without gaps
-    gaps: int  # number of intervals longer than one and a half median ones
+    gaps: int  # number of intervals longer than one and a half median intervals
     longest_ms: float  # longest interval
 
 
 @dataclass(frozen=True)
 class TopicDescription:
-    """Messages of one topic; values are None if there are too few messages."""
+    """Description of one topic's messages; values are None if there are too few messages."""
 
-    name: str  # of the topic
-    type_name: str  # of its messages
-    messages: int  # how many
-    regularity: Regularity | None = None  # of the times of recording
-    # stamps of the headers and times of recording compared; None also for messages without header
+    name: str  # name of the topic
+    type_name: str  # type of its messages
+    messages: int  # number of messages
+    regularity: Regularity | None = None  # regularity of the times of recording
+    # comparison of the headers' stamps with the times of recording; None also for messages without header
     clock: Clock | None = None
 
     @property
@@ -53,26 +53,26 @@ class TopicDescription:
 class Synchronisation:
     """Comparison of the stamps of two cameras' images."""
 
-    first: str  # camera, such as ``pair0 left``
-    second: str  # camera
-    offset: Offset | None  # of the second's stamps to the first's, or None if none belong together
-    images: int  # number of the first's
+    first: str  # first camera, such as ``pair0 left``
+    second: str  # second camera
+    offset: Offset | None  # offset of the second's stamps to the first's, or None if none belong together
+    images: int  # number of the first camera's images
 
 
 @dataclass(frozen=True)
 class Description:
     """Description of a session or bag."""
 
-    path: Path  # of the file or folder
-    size_bytes: int  # of the file or folder
-    duration_s: float  # from the first to the last message
-    library: str  # that wrote it, or empty
+    path: Path  # path of the file or folder
+    size_bytes: int  # size of the file or folder
+    duration_s: float  # time from the first to the last message
+    library: str  # library that wrote it, or empty
     is_whole: bool  # whether its writing was finished
-    # number of damaged chunks and other records among those that were read; of the chunks of graphvio's own sessions
-    # that is the first only
+    # number of damaged chunks and other records among those that were read; of graphvio's own sessions, only the first
+    # chunk is read
     damaged: int
     rig: str  # one line about the rig in it, or why that is not usable; empty if there is none
-    topics: tuple[TopicDescription, ...]  # by name
+    topics: tuple[TopicDescription, ...]  # all topics, by name
     # left and right of each pair, then the first pair and each other one, of the pairs that topics' names show
     synchronisation: tuple[Synchronisation, ...]
 
@@ -81,7 +81,7 @@ def describe(path: Path) -> Description:
     """Describe a session or bag.
 
     Raises:
-        SessionError: if it is no session or bag, or cannot be read.
+        SessionError: if the path is no session or bag, or cannot be read.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
     if not path.exists():
@@ -115,7 +115,7 @@ def regularity(stamps_ns: Int) -> Regularity | None:
     """Measure the intervals between stamps.
 
     Args:
-        stamps_ns: (N,) in any order, nanoseconds.
+        stamps_ns: stamps (N,) in nanoseconds, in any order.
 
     Returns:
         The figures, or None if there are too few stamps, or all are equal.

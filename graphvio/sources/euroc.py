@@ -1,4 +1,4 @@
-"""Reads EuRoC/ASL folders with any number of cameras, and TUM-VI's and Monado's recordings in the same layout."""
+"""Reader of EuRoC/ASL folders with any number of cameras, and of TUM-VI's and Monado's in the same layout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import read_frame_csv, read_imu_csv
 
 LAYOUT = "EuRoC/ASL and TUM-VI: mav0/cam0/data.csv"
-_TRUTHS = ("state_groundtruth_estimate0", "gt", "mocap0")  # of EuRoC, Monado and TUM-VI
+_TRUTHS = ("state_groundtruth_estimate0", "gt", "mocap0")  # folders of the true trajectory: EuRoC, Monado, TUM-VI
 
 
 def matches(path: Path) -> bool:
@@ -40,7 +40,7 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
 
 
 def _masks(folder: Path) -> ImageFiles:
-    """Index the masks in a folder, which are named by their images' stamps."""
+    """Index the mask files in a folder, whose names are their images' stamps."""
     stamps, files = _named_by_stamp(folder)
     return ImageFiles(folder, stamps, files)
 

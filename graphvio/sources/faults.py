@@ -14,10 +14,10 @@ class FaultLog:
     """Counts faults by kind, and keeps and logs the first of each kind.
 
     Args:
-        name: of the recording; begins each logged line.
+        name: name of the recording, with which each logged line begins.
 
     Attributes:
-        counts: kind -> how many there were.
+        counts: kind -> number of faults.
         events: the first fault of each kind, in the order in which they came.
     """
 
@@ -28,7 +28,7 @@ class FaultLog:
         self._logged: set[str] = set()
 
     def add(self, kind: EventKind, stamp_ns: int, detail: str, times: int = 1) -> None:
-        """Count a fault, where it came first in one line; nothing is counted if there is none."""
+        """Count faults of a kind, none if ``times`` is 0; ``stamp_ns`` and ``detail``, one line, describe the first."""
         if times <= 0:
             return
         first = kind not in self.counts
@@ -36,7 +36,7 @@ class FaultLog:
         if not first:
             return
         self.events.append(Event(stamp_ns, kind, detail))
-        if kind not in self._logged:  # not again when the recording is read a second time
+        if kind not in self._logged:  # not logged again when the recording is read a second time
             self._logged.add(kind)
             _log.warning("%s: %s: %s (later ones are only counted)", self.name, kind, detail)
 

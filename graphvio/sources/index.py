@@ -1,6 +1,6 @@
-"""Index of a recording: the images and samples in it, to which every format is brought.
+"""Index of a recording: its images and samples, in a common form for all formats.
 
-It takes some 100 bytes an image or sample, and is all that grows with the length of a recording.
+It takes some 100 bytes per image or sample, and nothing else in memory grows with the length of a recording.
 """
 
 from __future__ import annotations
@@ -16,39 +16,39 @@ from graphvio.sources.tables import ImuTable
 
 
 class ImageSequence(Protocol):
-    """Images of one camera, read one by one."""
+    """Interface to the images of one camera, which are read one by one."""
 
     @property
     def stamps_ns(self) -> Int:
         """(N,) stamps, as recorded, increasing; `Source` adds ``stamp_offset_s`` of the camera."""
 
     def read(self, row: int) -> Image:
-        """Return the image of a row, (height, width) uint8; from any thread.
+        """Return the image of a row, (height, width) uint8; may be called from any thread.
 
         Args:
-            row: index of its stamp.
+            row: index of the image's stamp.
 
         Raises:
-            ImageError: if it is missing or damaged.
+            ImageError: if the image is missing or damaged.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class ImageFiles:
-    """Image files in one folder."""
+    """An `ImageSequence` of image files in one folder."""
 
-    folder: Path  # that holds them
-    stamps_ns: Int  # (N,) as recorded, increasing
-    names: Sequence[str]  # of the files
+    folder: Path  # folder of the files
+    stamps_ns: Int  # (N,) stamps as recorded, increasing
+    names: Sequence[str]  # names of the files
 
     def read(self, row: int) -> Image:
-        """Return the image of a row, (height, width) uint8; from any thread.
+        """Return the image of a row, (height, width) uint8; may be called from any thread.
 
         Args:
-            row: index of its stamp.
+            row: index of the image's stamp.
 
         Raises:
-            ImageError: if it is missing or damaged.
+            ImageError: if the image is missing or damaged.
         """
         return read_grey(self.folder / self.names[row])
 
@@ -57,8 +57,8 @@ class ImageFiles:
 class Index:
     """Content of a recording."""
 
-    name: str  # of the recording
+    name: str  # name of the recording
     images: Mapping[str, ImageSequence]  # camera name -> its images
-    imu: ImuTable | None = None  # samples, or None if there are none
+    imu: ImuTable | None = None  # samples of the IMU, or None if there are none
     truth: Path | None = None  # file with the true trajectory, or None
-    masks: Mapping[str, ImageSequence] = field(default_factory=dict)  # camera name -> masks of its images, by stamp
+    masks: Mapping[str, ImageSequence] = field(default_factory=dict)  # camera name -> masks with their images' stamps

@@ -1,4 +1,4 @@
-"""Reads sequences of KITTI's odometry benchmark: ``image_0``, ``image_1``, ``times.txt``, ``calib.txt``."""
+"""Reader of sequences of KITTI's odometry benchmark: ``image_0``, ``image_1``, ``times.txt``, ``calib.txt``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def matches(path: Path) -> bool:
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
-    """Index the cameras of a rig; the images of row i are the i-th of each folder."""
+    """Index the cameras of a rig; the images with the time in line i of ``times.txt`` are named by i."""
     times = path / "times.txt"
     if not times.is_file():
         raise SourceError(f"{times}: is missing; it comes with KITTI's calibration files: put it there")

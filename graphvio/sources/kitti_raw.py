@@ -1,7 +1,7 @@
-"""Reads synchronised, rectified drives of KITTI's raw data: ``image_00/data/*.png``, ``image_00/timestamps.txt``.
+"""Reader of synchronised, rectified drives of KITTI's raw data: ``image_00/data/*.png``, ``image_00/timestamps.txt``.
 
-The i-th images of all cameras of such a drive belong together though their stamps differ a little, so both cameras of a
-pair take the stamps of the left one.
+The i-th images of all cameras of such a drive belong together although their stamps differ a little, so both cameras of
+a pair get the stamps of the left one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
 
 
 def _utc_ns(text: str) -> int | None:
-    """Nanoseconds since 1970, exactly, of ``2011-09-26 13:02:25.951199337``; None if it is no time."""
+    """Return exact nanoseconds since 1970 of a text like ``2011-09-26 13:02:25.951199337``; None if it is no time."""
     whole, _, fraction = text.strip().partition(".")
     try:
         moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)

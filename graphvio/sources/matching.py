@@ -1,4 +1,4 @@
-"""Matches images by their stamps: left to right of a pair, and pairs to framesets.
+"""Matching of images by their stamps: left and right images to pairs, and pairs to framesets.
 
 Images of different instants are never joined: pairs that are triggered at other times or rates make framesets of their
 own.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graphvio.arrays import Int
 
 TOLERANCE_NS = 2_000_000
-"""Pairs whose stamps differ by no more than this are of one instant, unless `open_source` gets another value."""
+"""Pairs whose stamps differ by no more than this are of one instant, unless `open_source` is given another value."""
 
 _PERIOD_SHARE = 3  # left and right may be a third of a period apart: a neighbour is then always farther away
 
@@ -26,26 +26,28 @@ Rows = NDArray[np.int32]
 class PairIndex:
     """Left and right images of one pair that belong together."""
 
-    stamps_ns: Int  # (N,) of the left images, increasing
+    stamps_ns: Int  # (N,) stamps of the left images, increasing
     rows: Rows  # (N, 2) rows of the left and the right image in their cameras' indexes
     left_alone: Int  # (L,) stamps of left images without a right one
     right_alone: Int  # (R,) stamps of right images without a left one
-    ambiguous: Int  # (A,) stamps of left images that were near to more than one right image, or whose right one was
-    tolerance_ns: int  # within which left and right were matched
+    # (A,) stamps of left images that have several right images within the tolerance, or whose right image has several
+    # left ones
+    ambiguous: Int
+    tolerance_ns: int  # tolerance within which left and right were matched
 
 
 @dataclass(frozen=True, eq=False)
 class FramesetIndex:
     """Framesets of a recording."""
 
-    stamps_ns: Int  # (F,) increasing, camera clock
+    stamps_ns: Int  # (F,) stamps, increasing, camera clock
     rows: Rows  # (F, P, 2) rows of the left and right image of each pair, -1 where the pair has none
 
 
 def tolerance_of(left_ns: Int) -> int:
-    """Return the tolerance between left and right images that suits the rate of the left ones (N,), nanoseconds.
+    """Return the tolerance between left and right images that suits the rate of the left stamps (N,), nanoseconds.
 
-    Stamps of arrival differ by some milliseconds though both images were triggered together.
+    If stamps are those of arrival, they differ by some milliseconds although both images were triggered together.
     """
     return int(np.median(np.diff(left_ns))) // _PERIOD_SHARE if len(left_ns) > 1 else TOLERANCE_NS
 
@@ -53,7 +55,7 @@ def tolerance_of(left_ns: Int) -> int:
 def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int | None = None) -> PairIndex:
     """Match left and right images of a pair by their stamps (N,) and (M,), which increase.
 
-    A tolerance of None is that of `tolerance_of`.
+    With a tolerance of None, that of `tolerance_of` is used.
     """
     if tolerance_ns is None:
         tolerance_ns = tolerance_of(left_ns)
@@ -87,21 +89,21 @@ def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int | None = None) ->
 
 
 def _near(stamps_ns: Int, at_ns: Int, tolerance_ns: int) -> Int:
-    """Count the stamps (N,), which increase, within the tolerance of each of others (M,)."""
+    """Return how many of the increasing ``stamps_ns`` (N,) are within the tolerance of each of ``at_ns`` (M,)."""
     first = np.searchsorted(stamps_ns, at_ns - tolerance_ns, side="left")
     return np.searchsorted(stamps_ns, at_ns + tolerance_ns, side="right") - first
 
 
 def of_single(stamps_ns: Int) -> PairIndex:
-    """Index the images (N,) of a camera without a partner, as if each were its own right one."""
+    """Index the images (N,) of a camera without a partner, as if each were also its own right image."""
     return match_sides(stamps_ns, stamps_ns)
 
 
 def group_pairs(pairs: Sequence[PairIndex], tolerance_ns: int = TOLERANCE_NS) -> FramesetIndex:
-    """Join pairs, at least one, of the same instant to framesets.
+    """Join the images of at least one pair into framesets, each of the same instant.
 
-    A frameset has the stamp of the first of its pairs; or of the earliest, if the next frameset would otherwise be
-    within the tolerance of this one.
+    A frameset has the stamp of the first of its pairs; or of the earliest pair, if the next frameset would otherwise be
+    within the tolerance of it.
     """
     count = len(pairs)
     first = pairs[0].stamps_ns

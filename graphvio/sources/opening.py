@@ -1,4 +1,4 @@
-"""Opens recordings, whatever their layout."""
+"""Opening of recordings of any known layout."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ def open_source(
     tolerance_ms: float | None = None,
     topics: Mapping[str, str] | None = None,
 ) -> Source:
-    """Open a recording, whatever its layout.
+    """Open a recording of any known layout.
 
     Args:
         path: folder of the recording, or file of a session or bag.
-        rig: decides which pairs are read, and whether the IMU is; None takes the recording's own.
-        from_s: where to begin, seconds after the recording's first frameset.
-        to_s: where to end (inclusive), on the same scale.
-        tolerance_ms: images whose stamps differ by no more are of one instant. Left and right images farther apart
-            are no pair, and pairs farther apart make framesets of their own. None takes a third of the left camera's
+        rig: rig that decides which pairs are read, and whether the IMU is; None takes the recording's own.
+        from_s: time to begin at, seconds after the recording's first frameset.
+        to_s: time to end at (inclusive), on the same scale.
+        tolerance_ms: images whose stamps differ by no more than this are of one instant. Left and right images farther
+            apart are no pair, and pairs farther apart make separate framesets. None takes a third of the left camera's
             median period for left and right, whose stamps may be those of arrival, and 2 ms for pairs.
         topics: name of a camera, or ``imu`` -> topic, for sessions and bags whose topics have other names.
 
     Returns:
-        The recording, to be iterated as often as wanted; images are decoded while it is.
+        The recording, which can be iterated any number of times; images are decoded during the iteration.
 
     Raises:
         SourceError: if the folder cannot be read, has no known layout, or holds nothing in the given time.
@@ -74,7 +74,7 @@ def read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[
     """Index a recording; arguments and errors are those of `open_source`.
 
     Returns:
-        The index of all images and samples, the rig, and what was wrong with single files or lines so far.
+        The index of all images and samples, the rig, and the faults of single files or lines so far.
     """
     _check_exists(path)
     resolved = path.resolve()
@@ -92,11 +92,11 @@ def read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[
 
 
 def recorded_rig(path: Path) -> Rig:
-    """Read the rig that a recording carries, whether or not all of its cameras have images there.
+    """Read the rig that a recording contains, whether or not it has images of all of the rig's cameras.
 
     Raises:
-        SourceError: if it cannot be read or has no known layout.
-        RigError: if it has no rig that is usable.
+        SourceError: if the recording cannot be read or has no known layout.
+        RigError: if it has no usable rig.
         SessionError: if a session or bag cannot be read.
         MissingExtraError: if it is a session or bag, and the extra ``sessions`` is not installed.
     """
@@ -117,7 +117,7 @@ def layout_of(path: Path) -> Layout:
     """Return the layout of a folder.
 
     Raises:
-        SourceError: if it is none, or has none that is known; the message says which recording may be meant.
+        SourceError: if the path is no folder, or has no known layout; the message names recordings that may be meant.
     """
     if not path.is_dir():
         instead = meant_instead(path, is_recording)
@@ -137,7 +137,7 @@ def layout_of(path: Path) -> Layout:
 
 
 def _layouts() -> Iterator[Layout]:
-    """Yield all layouts, built-in ones first: plug-ins are loaded where none of these matches."""
+    """Yield all layouts, built-in ones first, so that plug-ins are loaded only if none of these matches."""
     yield from _LAYOUTS
     yield from plug_ins().layouts
 

@@ -1,4 +1,4 @@
-"""Layouts of recordings that other packages add, by entry points of the group ``graphvio.sources``."""
+"""Layouts of recordings that other packages add with entry points of the group ``graphvio.sources``."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ class Layout(Protocol):
     """Reader of recordings of one layout: a module, or any object, with these members.
 
     Attributes:
-        LAYOUT: The layout in words, for messages, such as ``KITTI odometry: image_0/*.png, times.txt``.
+        LAYOUT: Description of the layout for messages, such as ``KITTI odometry: image_0/*.png, times.txt``.
     """
 
     LAYOUT: str
 
     def matches(self, path: Path) -> bool:
-        """Return whether a folder has this layout, from the names of files in it."""
+        """Return whether a folder has this layout, judging by the names of files in it."""
 
     def read_index(self, path: Path, rig: Rig, faults: FaultLog) -> Index:
         """Index the images of a rig's cameras, and the IMU if it has one.
 
         Args:
             path: Folder of the recording.
-            rig: Cameras to read.
-            faults: Takes what is wrong with single files or lines.
+            rig: Rig with the cameras to read.
+            faults: Collects faults of single files or lines.
 
         Raises:
             SourceError: If the folder cannot be read.
@@ -43,8 +43,8 @@ class PlugIns(NamedTuple):
     """The layouts of installed packages.
 
     Attributes:
-        layouts: Those that could be loaded, sorted by name.
-        failures: Why each of the others could not be.
+        layouts: The layouts that could be loaded, sorted by name.
+        failures: For each of the others, why it could not be loaded.
     """
 
     layouts: tuple[Layout, ...]
@@ -53,13 +53,13 @@ class PlugIns(NamedTuple):
 
 @cache
 def plug_ins() -> PlugIns:
-    """Load the layouts of installed packages, once for a process."""
+    """Load the layouts of installed packages, once per process."""
     layouts: list[Layout] = []
     failures: list[str] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
             layout = entry.load()
-        except Exception as error:  # whatever somebody's module raises
+        except Exception as error:  # the module of another package may raise anything
             failures.append(f"the plug-in {entry.name} ({entry.value}) cannot be loaded: {error}")
             continue
         missing = [name for name in ("LAYOUT", "matches", "read_index") if not hasattr(layout, name)]

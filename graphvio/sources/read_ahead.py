@@ -1,4 +1,4 @@
-"""Prepares results ahead of their use in threads: bounded, in order, and ended with the consumer."""
+"""Preparation of results ahead of their use, in threads: bounded, in order, and ended with the consumer."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ R = TypeVar("R")
 def read_ahead(work: Callable[[T], R], items: Iterable[T], depth: int = 8) -> Generator[R, None, None]:
     """Yield ``map(work, items)``, with results prepared ahead in two threads.
 
-    The items are made in the calling thread, ``depth`` at most before their results are taken. An exception of ``work``
-    is raised where its result is due. The threads end when the iterator is exhausted, closed or collected.
+    The items are made in the calling thread, at most ``depth`` of them before their results are taken. An exception of
+    ``work`` is raised where its result is due. The threads end when the iterator is exhausted, closed or collected.
     """
     waiting: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(2, thread_name_prefix="graphvio-read")

@@ -1,9 +1,9 @@
-"""Prepares results ahead of their use in a process of its own, with which this one shares neither interpreter nor heap.
+"""Preparation of results ahead of their use in a separate process, which shares neither interpreter nor heap.
 
-Images that are decoded in threads slow down the odometry beside them: the threads take turns at the interpreter some
-hundred times a frameset, and each turn takes its state to another core. A process costs one copy of the images.
+Decoding images in threads slows down the odometry in the same process: the threads take turns at the interpreter some
+hundred times per frameset, and each turn moves its state to another core. A process costs one copy of the images.
 
-It is forked: it has nothing to import, and what both processes have in common is in memory once.
+The process is forked, so that it need not import anything, and common data are in memory only once.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 _log = logging.getLogger(__name__)
-_TIMEOUT_S = 60.0  # a forked process may wait for a lock that another thread held, for ever
-_NICENESS = 5  # results are ready ahead of time; who takes them comes first
+_TIMEOUT_S = 60.0  # a forked process may wait forever for a lock that another thread held
+_NICENESS = 5  # lower priority: results are prepared ahead of time, and their consumer comes first
 
 
 def can_fork() -> bool:
-    """Return whether a process can be forked here and has a core: on Linux, with two of them."""
+    """Return whether a process can be forked here and has a core to itself: on Linux, with at least two cores."""
     return sys.platform == "linux" and usable_cores() > 1
 
 
@@ -42,14 +42,14 @@ def read_ahead_in_process(
 ) -> Generator[R, None, None]:
     """Yield ``map(work, items)``, with results prepared ahead in a forked process; only where `can_fork`.
 
-    Where the process cannot be started or ends early, threads of this one go on from the result that is due, as
-    `read_ahead` does. An exception of ``work`` ends it, and is raised here. The process ends when the iterator is
-    exhausted, closed or collected, and with this process at the latest.
+    If the process cannot be started or ends early, threads of this process continue from the result that is due, as
+    `read_ahead` does. An exception of ``work`` ends the process, and is raised here. The process ends when the iterator
+    is exhausted, closed or collected, and with this process at the latest.
 
     Args:
-        work: called in the process. Files and locks of other threads are not to be used in it.
-        items: that it is called with.
-        buffer_bytes: room for the arrays of a result. Those of larger ones take longer.
+        work: function that is called in the process; it must not use files and locks of other threads.
+        items: items that it is called with.
+        buffer_bytes: room for the arrays of one result; larger results take longer.
         depth: how many results may wait.
     """
     done = 0
@@ -68,7 +68,7 @@ def read_ahead_in_process(
 
 
 class _Process:
-    """The process, and the memory through which the arrays of its results come."""
+    """The forked process, and the shared memory through which the arrays of its results are passed."""
 
     def __init__(self, work: Callable[[T], Any], items: Sequence[T], buffer_bytes: int, depth: int) -> None:
         self._slots = _Slots(buffer_bytes, depth)
@@ -83,7 +83,7 @@ class _Process:
 
         self._process = context.Process(target=serve, name="graphvio-read", daemon=True)
         with HeldInterrupt() as interrupt, warnings.catch_warnings():  # Python drops errors while it forks
-            warnings.simplefilter("ignore", DeprecationWarning)  # of locks that threads hold: there is a timeout
+            warnings.simplefilter("ignore", DeprecationWarning)  # on locks that threads hold: there is a timeout
             self._process.start()
         results.close()
         freed.close()
@@ -101,7 +101,7 @@ class _Process:
         if message is None:
             return []
         result = self._slots.load(*message)
-        with suppress(BrokenPipeError):  # it is through
+        with suppress(BrokenPipeError):  # the process has sent all results
             self._freed.send_bytes(b"1")
         return [result]
 
@@ -114,7 +114,7 @@ class _Process:
 
 
 class _Slots:
-    """Memory that two processes share, with room for the arrays of some results, of which each has a slot in turn."""
+    """Memory that two processes share, divided into slots, each with room for the arrays of one result."""
 
     def __init__(self, slot_bytes: int, depth: int) -> None:
         self.depth = depth
@@ -123,7 +123,7 @@ class _Slots:
         self._at = 0
 
     def store(self, result: Any) -> tuple[list[int], bytes]:
-        """Store the arrays of a result in the next slot; returns their sizes, and the pickled result without them."""
+        """Store the arrays of a result in the next slot; return their sizes, and the pickled result without them."""
         buffers: list[pickle.PickleBuffer] = []
         pickled = pickle.dumps(result, protocol=5, buffer_callback=buffers.append)
         views = [buffer.raw() for buffer in buffers]
@@ -136,7 +136,7 @@ class _Slots:
         return [view.nbytes for view in views], pickled
 
     def load(self, sizes: list[int], pickled: bytes) -> Any:
-        """Return the result whose arrays are in the next slot; they are copied, and the slot is free."""
+        """Return the result whose arrays are in the next slot; they are copied, so that the slot is free afterwards."""
         at, buffers = self._next(), []
         with memoryview(self._memory) as memory:
             for size in sizes:
@@ -151,7 +151,7 @@ class _Slots:
 
 
 def _serve(work: Callable[[T], Any], items: Sequence[T], slots: _Slots, results: Connection, freed: Connection) -> None:
-    """Send the results of all items to the parent; None in place of one that cannot be had here."""
+    """Send the results of all items to the parent; send None and end if ``work`` fails."""
     ignore_interrupts()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(_NICENESS)
@@ -161,7 +161,7 @@ def _serve(work: Callable[[T], Any], items: Sequence[T], slots: _Slots, results:
                 freed.recv_bytes()
             try:
                 message = slots.store(work(item))
-            except Exception:  # the parent meets it again, and raises it
+            except Exception:  # the parent calls `work` itself, and raises it
                 results.send(None)
                 return
             results.send(message)

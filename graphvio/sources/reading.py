@@ -1,4 +1,4 @@
-"""What is read of a recording: a part of its rig and of its time, and which topics are whose."""
+"""Options of reading a recording: which part of its rig and of its time is read, and from which topics."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from graphvio.sources.recording import Source
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read of each recording, as the options of a command say."""
+    """What is read of each recording, as given by the options of a command."""
 
     pairs: tuple[int, ...] | None = None  # numbers of the stereo pairs; None for all
     cameras: tuple[str, ...] | None = None  # names of the cameras; None for all
-    with_pairs: bool = True  # whether pairs stay pairs; else each camera is a single one
+    with_pairs: bool = True  # whether pairs stay pairs; otherwise each camera is a single one
     with_imu: bool = True  # whether the IMU is used
     topics: tuple[tuple[str, str], ...] = ()  # cameras of the rig, or ``imu``, with their topics
-    from_s: float | None = None  # second of the recording to begin at
-    to_s: float | None = None  # second to end at
+    from_s: float | None = None  # seconds after the first frameset at which to begin, or None
+    to_s: float | None = None  # seconds after the first frameset at which to end, or None
 
     def of(self, rig: Rig) -> Rig:
         """Return the part of a rig that is read."""
@@ -30,15 +30,15 @@ class Reading:
         return rig if self.with_imu else rig.without_imu()
 
     def open(self, path: Path, rig: Rig | None, tolerance_ms: float | None) -> Source:
-        """Open what is read of a recording.
+        """Open a recording, of which the selected part is read.
 
         Args:
             path: folder of the recording, or file of a session or bag.
-            rig: of the whole recording; None takes the recording's own.
-            tolerance_ms: within which images are of one instant, see `open_source`.
+            rig: rig of the whole recording; None takes the recording's own.
+            tolerance_ms: tolerance within which images are of one instant, see `open_source`.
 
         Raises:
-            SourceError: if it cannot be read, has no known layout, or holds nothing in the given time.
+            SourceError: if the recording cannot be read, has no known layout, or holds nothing in the given time.
             RigError: if there is no rig, or it has no such pairs or cameras.
             SessionError: if a session or bag cannot be read.
         """

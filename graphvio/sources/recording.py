@@ -1,4 +1,4 @@
-"""Lazy reading of a recording by its index: images are decoded ahead, matched to framesets and merged with the IMU."""
+"""Lazy reading of a recording by its index: images are decoded ahead, joined to framesets and merged with the IMU."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class _Decoded:
 class Source:
     """A recording as a stream of IMU samples and framesets in time order; may be iterated more than once.
 
-    Arguments are those of `graphvio.sources.open_source`, and what `graphvio.sources.opening.read_index` returns.
+    Arguments are those of `graphvio.sources.open_source`, and the results of `graphvio.sources.opening.read_index`.
 
     Attributes:
-        name: of the recording, fit for a folder of results.
-        rig: of the measurements; its IMU is None if the recording has no samples.
-        faults: of the recording; complete once an iteration has ended, and counted again by the next one.
+        name: name of the recording, which can also be used for a folder of results.
+        rig: rig of the measurements; its IMU is None if the recording has no samples.
+        faults: faults of the recording; complete once an iteration has ended, and counted again by the next one.
         frameset_count: number of framesets, of which those without usable images are not yielded.
         stamps_ns: (N,) stamps of the framesets, camera clock, increasing; offsets of cameras' stamps are corrected.
         start_ns: stamp of the first frameset.
@@ -52,7 +52,7 @@ class Source:
         truth: file, session or bag from which `load_trajectory` reads the true trajectory, or None.
         decode_ms: time that the decoding of each frameset took in its thread, milliseconds.
         decodes_in_process: whether image files are decoded in a forked process while the recording is iterated, which
-            is faster, rather than in threads. False; for programs that know that they can be forked.
+            is faster, rather than in threads. False by default; to be set by programs that can safely be forked.
 
     Raises:
         SourceError: if no frameset is left.
@@ -104,7 +104,7 @@ class Source:
             yield from merge(self._read_imu(), framesets, offset_ns)
 
     def frameset_at(self, stamp_ns: int) -> FrameSet:
-        """Return the usable images of one frameset, out of order; from any thread.
+        """Return the usable images of any one frameset; may be called from any thread.
 
         Raises:
             SourceError: if there is no frameset with this stamp.
@@ -205,7 +205,7 @@ class Source:
         for number, images in item.images.items():
             cameras = self.rig.groups[number].cameras
             fit = [self._fits(camera, image, item.stamp_ns) for camera, image in zip(cameras, images, strict=True)]
-            if all(fit):  # each one that does not is counted
+            if all(fit):  # `_fits` counts each one that does not
                 good[number] = images
         return good
 
@@ -215,7 +215,7 @@ class Source:
             self._fit_cameras.add(camera.name)
             return True
         detail = f"{camera.name}: image is {size[0]}x{size[1]}, the rig says {expected[0]}x{expected[1]}"
-        if camera.name not in self._fit_cameras:  # not one that fits: the rig is of other cameras
+        if camera.name not in self._fit_cameras:  # no image has fitted so far: the rig is of other cameras
             raise RigError(
                 f"{self.name}: {detail}; calibrate at the recording's size, or give the rig that belongs to it"
             )

@@ -1,4 +1,4 @@
-"""Merges IMU samples and framesets in the order in which an estimator needs them."""
+"""Merging of IMU samples and framesets in the order in which an estimator needs them."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Iterable, Iterator
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 COVER_NS = 50_000_000
-"""A sample that is later than this after a frameset does not cover it: the IMU has a gap there."""
+"""A sample that is later than this after a frameset does not cover the frameset: the IMU has a gap there."""
 
 
 def merge(imu: Iterable[ImuSample], framesets: Iterable[FrameSet], time_offset_ns: int = 0) -> Iterator[Measurement]:
     """Yield all samples and framesets in time order, each frameset after the sample that covers it.
 
-    The covering sample is the first at or after the frameset's instant on the IMU's clock. In a gap of the IMU and
-    after its end there is none, and the frameset comes without it. Samples after the last frameset follow it.
+    The covering sample is the first one at or after the frameset's instant on the IMU's clock. In a gap of the IMU and
+    after its end there is none, and the frameset is yielded without it. Samples after the last frameset follow it.
 
     Args:
-        imu: in time order, IMU clock.
-        framesets: in time order, camera clock.
-        time_offset_ns: add it to a frameset's stamp to get the IMU's stamp of the same instant.
+        imu: samples in time order, IMU clock.
+        framesets: framesets in time order, camera clock.
+        time_offset_ns: offset to add to a frameset's stamp to get the IMU's stamp of the same instant.
     """
     samples = iter(imu)
     pending = next(samples, None)

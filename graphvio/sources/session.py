@@ -1,4 +1,4 @@
-"""Reads sessions, other MCAP files, and bags of ROS 1 and ROS 2."""
+"""Reader of sessions, other MCAP files, and bags of ROS 1 and ROS 2."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _MASKS = "/mask"  # after a camera's name
 
 
 def rig_in(store: Store) -> Rig | None:
-    """Return the rig that is stored in a session, or that its messages describe; None if there is none."""
+    """Return the rig that is stored in a session, or that its messages describe; None if there is neither."""
     damaged = SessionError(f"{store.path}: the rig in it is damaged; copy the file again, or give a rig of your own")
     attached = store.attachments.get(RIG_ATTACHMENT)
     if attached is not None:
@@ -59,7 +59,7 @@ def rig_in(store: Store) -> Rig | None:
 
 
 def read_index(store: Store, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
-    """Index the cameras of a rig, and the IMU if it has one; ``topics`` gives those with other names by camera."""
+    """Index the cameras of a rig, and the IMU if it has one; ``topics``: camera or ``imu`` -> topic of another name."""
     chosen = {name: _named(store, topic) for name, topic in topics.items()}
     names = {camera.name for camera in rig.cameras}
     unknown = set(chosen) - names - {name + _MASKS for name in names} - {_IMU_NAME}
@@ -90,7 +90,7 @@ def _named(store: Store, name: str) -> Topic:
 
 
 class _Images:
-    """Images of one topic: an `ImageSequence`."""
+    """An `ImageSequence` of the images of one topic."""
 
     def __init__(self, store: Store, topic: Topic, faults: FaultLog) -> None:
         self._store, self._topic = store, topic
@@ -115,7 +115,7 @@ class _Images:
 
 
 def _topic_of(store: Store, pair: str, side: str, camera: Camera) -> Topic:
-    """Return the topic of a camera's images: as graphvio names it, or with the camera's name in its own."""
+    """Return the topic of a camera's images: the one that graphvio uses, or one whose name has the camera's in it."""
     for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png"), camera.name):
         if name in store.topics:
             return store.topics[name]
@@ -128,7 +128,7 @@ def _topic_of(store: Store, pair: str, side: str, camera: Camera) -> Topic:
 
 
 def _topic_of_masks(store: Store, pair: str, side: str, images: Topic) -> Topic | None:
-    """Return the topic of the masks of a camera's images: as graphvio names it, or beside that of the images."""
+    """Return the topic of the masks of a camera's images: the one that graphvio uses, or one beside the images'."""
     beside = camera_of(images.name, sides=()) + _MASKS
     for name in (mask_topic(pair, side, "raw"), mask_topic(pair, side, "png"), beside, f"{beside}/compressed"):
         topic = store.topics.get(name)
@@ -138,7 +138,7 @@ def _topic_of_masks(store: Store, pair: str, side: str, images: Topic) -> Topic 
 
 
 def _read_imu(store: Store, chosen: Topic | None, faults: FaultLog) -> ImuTable | None:
-    """Return the samples of the chosen topic, or else of the first that has any."""
+    """Return the samples of the chosen topic, or if none is chosen of the first topic that has any."""
     found = of_type(store.topics, IMU)
     if chosen is None and len(found) > 1:
         names = ", ".join(each.name for each in found)

@@ -1,4 +1,4 @@
-"""Where the recordings are that a path which is none may have meant: below it, or around it."""
+"""Search for the recording that may be meant by a path that is not one: below the path, or around it."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pathlib import Path
 from graphvio.sessions.store import SUFFIXES
 
 _MAX_NAMED = 3
-_LEVELS_BELOW = 2  # such as of GROUP/SEQUENCE in a data set; a home folder has too much below
-_LEVELS_ABOVE = 3  # such as of mav0/cam0/data
-_FILE_OF_BAG = re.compile(r".+_\d+\.(db3|mcap)")  # one of several, as ROS 2 names them
+_LEVELS_BELOW = 2  # such as GROUP/SEQUENCE in a data set; more would take too long in a home folder
+_LEVELS_ABOVE = 3  # such as mav0/cam0/data
+_FILE_OF_BAG = re.compile(r".+_\d+\.(db3|mcap)")  # one of several files of a bag, as ROS 2 names them
 _CALIBRATIONS = (".yaml", ".yml", ".json")
-_RESULTS = ("summary.json", "report.html", "map.json")  # of run and optimize, calibrate, slam
+_RESULTS = ("summary.json", "report.html", "map.json")  # results of run and optimize, calibrate, slam
 
 
 def recordings_below(path: Path, depth: int, is_recording: Callable[[Path], bool]) -> Iterator[Path]:
-    """Yield the recordings at or below a path; what is inside a recording is part of it.
+    """Yield the recordings at or below a path, without searching inside of recordings.
 
     Args:
-        path: to begin at.
+        path: path to begin at.
         depth: levels of folders to go down.
-        is_recording: whether a path has a known layout.
+        is_recording: returns whether a path has a known layout.
     """
     if is_recording(path):
         yield path
@@ -34,14 +34,14 @@ def recordings_below(path: Path, depth: int, is_recording: Callable[[Path], bool
 
 
 def meant_instead(path: Path, is_recording: Callable[[Path], bool]) -> str:
-    """Say what to give instead of a path that is no recording.
+    """Return a hint on what to give instead of a path that is no recording.
 
     Args:
         path: an existing file or folder.
-        is_recording: whether a path has a known layout.
+        is_recording: returns whether a path has a known layout.
 
     Returns:
-        A clause of a message that ends with "; ", or an empty text where nothing near it is a recording.
+        A clause of a message that ends with "; ", or an empty text if there is no hint.
     """
     if path.is_file() and path.suffix in _CALIBRATIONS:
         return f"if it is a calibration, graphvio rig {path} shows it; "
@@ -52,7 +52,7 @@ def meant_instead(path: Path, is_recording: Callable[[Path], bool]) -> str:
         return f"it is inside the recording {_shown(around.parent if around.name == 'mav0' else around)}; give that; "
     try:
         below = list(islice(recordings_below(path, _LEVELS_BELOW, is_recording), _MAX_NAMED + 1))
-    except OSError:  # a folder of somebody else
+    except OSError:  # a folder without permission
         return ""
     if not below:
         return ""

@@ -1,4 +1,4 @@
-"""Reads tables of stamped rows tolerantly, and cleans their stamps, which are never converted to floats."""
+"""Tolerant reading of tables of stamped rows, and cleaning of their stamps, which are never converted to floats."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ V = TypeVar("V")
 _MAX_STAMP_NS = 2**62  # the year 2116; offsets can be added without an overflow of int64
 _HOUR_NS = 3_600_000_000_000
 _MAX_OUTLIERS = 2
-_MIN_STEPS_SHARE = 0.2  # of steps that are not zero: stamps in seconds, read as nanoseconds, are mostly equal
+_MIN_STEPS_SHARE = 0.2  # minimum share of non-zero steps: stamps in seconds, read as nanoseconds, mostly repeat
 _MIN_PERIOD_NS, _MIN_ROWS = 20_000, 10  # no camera or IMU is faster than 50 kHz
-_SHOWN = 30  # characters of a line that is not understood
+_SHOWN = 30  # characters that are shown of a line that is not understood
 _FORCE_M_S2 = (5.0, 20.0)
-"""Plausible median of the magnitude of specific force: gravity, and what a walk, a car or a drone adds."""
+"""Plausible range of the median magnitude of specific force: gravity, plus what a walk, a car or a drone adds."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImuTable:
     """Samples of an IMU."""
 
-    stamps_ns: Int  # (N,) increasing, IMU clock
+    stamps_ns: Int  # (N,) stamps, increasing, IMU clock
     values: Float  # (N, 6) angular velocity, rad/s, then specific force, m/s^2; frame body
 
 
 def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
-    """Read EuRoC's ``imu0/data.csv``; rows that are no samples, repeated or out of order are dropped and counted."""
+    """Read EuRoC's ``imu0/data.csv``; invalid, repeated and out-of-order rows are dropped and counted."""
     table = _read_fast(path)
     if table is None:
         table = _read_tolerant(path, faults)
@@ -66,10 +66,10 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
 
 
 def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
-    """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and names of the images.
+    """Read EuRoC's ``cam0/data.csv``; returns stamps (N,), increasing, and the names of the images.
 
     Raises:
-        SourceError: if it has none, or stamps in another unit.
+        SourceError: if it has no stamps, or stamps in another unit.
     """
 
     def frame(cells: list[str]) -> tuple[int, str] | None:
@@ -91,9 +91,9 @@ def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
 
 
 def read_times(path: Path, parse: Callable[[str], int | None], faults: FaultLog) -> tuple[Int, list[int]]:
-    """Read a file with the time of a frame in each line: stamps (N,), increasing, and their lines, from 0.
+    """Read a file with the time of a frame in each line; returns stamps (N,), increasing, and line numbers from 0.
 
-    ``parse`` returns the nanoseconds of a line, or None if it is no time.
+    ``parse`` returns the nanoseconds of a line, or None if the line is no time.
     """
 
     def frame(row: tuple[int, str]) -> tuple[int, int] | None:
@@ -137,7 +137,7 @@ def imu_row(stamp_ns: int | None, cells: Sequence[str]) -> tuple[int, list[float
 
 
 def parse_stamp(text: str) -> int | None:
-    """Return whole nanoseconds, exactly, also of ``1.4e18``; None if the text is no stamp."""
+    """Return the exact whole nanoseconds of a text, which may be like ``1.4e18``; None if it is no stamp."""
     try:
         stamp = int(text)
     except ValueError:
@@ -146,7 +146,7 @@ def parse_stamp(text: str) -> int | None:
 
 
 def decimal_ns(text: str, unit_ns: int) -> int | None:
-    """Return whole nanoseconds of a decimal number in units of ``unit_ns``; None if the text is no such number."""
+    """Return the whole nanoseconds of a decimal number in units of ``unit_ns``; None if the text is no such number."""
     try:
         value = Decimal(text.strip()) * unit_ns
     except InvalidOperation:
@@ -157,12 +157,12 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
 
 
 def _refuse_other_units(stamps_ns: Int, path: Path) -> None:
-    """Refuse stamps of a whole table that can only be in seconds, milliseconds or microseconds."""
+    """Raise a `SourceError` if a table's stamps can only be in seconds, milliseconds or microseconds, or decrease."""
     if len(stamps_ns) < _MIN_ROWS:
         return
     steps_ns = np.diff(stamps_ns)
     if np.count_nonzero(steps_ns) > _MIN_STEPS_SHARE * len(steps_ns):
-        steps_ns = steps_ns[steps_ns != 0]  # rows that are there twice are counted later
+        steps_ns = steps_ns[steps_ns != 0]  # repeated rows are counted later
     period_ns = float(np.median(steps_ns))
     if period_ns < _MIN_PERIOD_NS:
         if period_ns < 0.0:
@@ -174,11 +174,11 @@ def _refuse_other_units(stamps_ns: Int, path: Path) -> None:
 
 
 def clean_stamps(stamps_ns: Int, sensor: Literal["imu", "frame"], path: Path, faults: FaultLog) -> Bool:
-    """Return which rows (N,) to keep so that stamps increase and the fewest rows are dropped; those are counted.
+    """Return which rows (N,) to keep so that stamps increase and the fewest rows are dropped; dropped ones are counted.
 
-    The longest increasing subsequence is kept. So one stamp far in the future costs one row, not all that follow it; of
-    equal stamps the first is kept. Of these, one or two rows that lie hours from all others are dropped, such as the
-    stamp 0 of a driver that has no time yet.
+    The longest increasing subsequence is kept, so that one stamp far in the future costs one row, not all that follow
+    it; of equal stamps the first is kept. From these, one or two rows that lie hours from all others are also dropped,
+    such as the stamp 0 of a driver that has no time yet.
     """
     increasing = np.ones(len(stamps_ns), dtype=np.bool_)
     if (np.diff(stamps_ns) <= 0).any():
@@ -202,7 +202,7 @@ def clean_stamps(stamps_ns: Int, sensor: Literal["imu", "frame"], path: Path, fa
 
 
 def _clock_set_back(stamps_ns: Int, dropped: Bool) -> str:
-    """Say where a clock was set back, and what to do, if the dropped rows (N,) are all those before or after that."""
+    """Describe where a clock was set back, and the remedy; empty unless all rows before or after that are dropped."""
     rows, steps = np.flatnonzero(dropped), np.flatnonzero(np.diff(stamps_ns) < 0) + 1
     if len(steps) != 1 or len(rows) < _MIN_ROWS or rows[-1] - rows[0] >= len(rows):
         return ""
@@ -211,7 +211,7 @@ def _clock_set_back(stamps_ns: Int, dropped: Bool) -> str:
 
 
 def _far_from_all(stamps_ns: Int) -> Bool:
-    """Which increasing stamps (N,) are too few, and too far from all others, to be part of the recording."""
+    """Return which increasing stamps (N,) are too few, and too far from all others, to be part of the recording."""
     runs = np.split(np.arange(len(stamps_ns)), np.flatnonzero(np.diff(stamps_ns) > _HOUR_NS) + 1)
     far = np.zeros(len(stamps_ns), dtype=np.bool_)
     if max(len(run) for run in runs) > _MAX_OUTLIERS:
@@ -247,7 +247,7 @@ def _read_fast(path: Path) -> ImuTable | None:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns when it cuts a stamp that is written as a float
             table = np.loadtxt(path, dtype=row, delimiter=",", comments="#", ndmin=1, encoding="utf-8")
-    except (ValueError, OverflowError, OSError, Warning):  # the tolerant reader finds the row
+    except (ValueError, OverflowError, OSError, Warning):  # the tolerant reader finds the row that is wrong
         return None
     return ImuTable(np.ascontiguousarray(table["stamp"]), np.ascontiguousarray(table["values"]))
 
@@ -261,7 +261,7 @@ def _read_tolerant(path: Path, faults: FaultLog) -> ImuTable:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of each row but a header in words."""
+    """Yield line number and cells of each row, except for a first row without a number, which is a header."""
     for count, (number, line) in enumerate(rows_in_lines(path)):
         cells = _cells(line)
         if count or any(_is_number(cell) for cell in cells):
@@ -277,14 +277,14 @@ def rows_in_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _cells(line: str) -> list[str]:
-    """Return the cells of a row that commas, spaces or semicolons separate; with semicolons, commas are decimal."""
+    """Return the cells of a row, separated by commas, spaces or semicolons; with semicolons, commas are decimal."""
     if ";" in line:
         return [cell.strip().replace(",", ".") for cell in line.split(";")]
     return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def read_lines(path: Path) -> list[str]:
-    """Read the lines of a text file with any line ends; bytes that are no text spoil only their line."""
+    """Read the lines of a text file with any line ends; bytes that are no valid text affect only their line."""
     with reading(path, SourceError, "check the recording"):
         return path.read_text(encoding="utf-8-sig", errors="replace").split("\n")
 

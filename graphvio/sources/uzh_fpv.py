@@ -1,7 +1,7 @@
-"""Reads UZH-FPV's drone races: ``left_images.txt``, ``right_images.txt``, ``imu.txt``, ``img``.
+"""Reader of UZH-FPV's drone races: ``left_images.txt``, ``right_images.txt``, ``imu.txt``, ``img``.
 
-Rows are ``id stamp_s path`` and ``id stamp_s wx wy wz ax ay az``. The calibration is a Kalibr chain in a folder of its
-own, whose ``cam0`` is the left camera.
+Rows are ``id stamp_s path`` and ``id stamp_s wx wy wz ax ay az``. The calibration is a Kalibr chain in another folder,
+whose ``cam0`` is the left camera.
 """
 
 from __future__ import annotations

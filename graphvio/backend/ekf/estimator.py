@@ -23,10 +23,10 @@ from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import LocatedPoints, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
-_RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
-_MIN_GROWTH = 1e-4  # of a pose's covariance from frameset to frameset, as a share of it
+_RESET_SIGMA_M = 1e-3  # the position's own standard deviation after a reset
+_MIN_GROWTH = 1e-4  # least growth of a pose's covariance from frameset to frameset, as a share of it
 _UNKNOWN_RATE_SIGMA_RAD_S = 3.0
-_UNKNOWN_SPEED_SIGMA_M_S = 30.0  # on foot or on the road
+_UNKNOWN_SPEED_SIGMA_M_S = 30.0  # includes walking and driving
 _GATED = {
     "vision": EventKind.VISION_GATED,
     "gyro": EventKind.GYRO_GATED,
@@ -58,12 +58,12 @@ class FilterEstimator:
         self._has_imu = False
         self._latest_ns = self._reset_ns = 0
         self._before_ns: int | None = None  # stamp at which the newest step began
-        self._refused_ns: int | None = None  # since when vision is refused
+        self._refused_ns: int | None = None  # stamp since which vision has been refused
         self._interval: ImuInterval | None = None
         self._reset_covariance = np.zeros((3, 3))  # position covariance, nav, that resets took out of the filter
         self._before_outage = np.zeros((3, 3))  # position covariance, nav, when vision was last used
         self._poses: dict[int, Float] = {}  # nav_T_body at stamps that motions are measured from
-        self._covariances: dict[int, Float] = {}  # of these poses as they were known then
+        self._covariances: dict[int, Float] = {}  # covariances of these poses at their stamps
 
     @property
     def is_initialised(self) -> bool:
@@ -103,8 +103,8 @@ class FilterEstimator:
     def covariance_since(self, then_ns: int) -> Float | None:
         """Return the growth (6, 6) of the pose's covariance since then, or None if that pose was not kept.
 
-        A filter has no state but the newest, and so no correlation with earlier ones. In directions in which the
-        covariance has not grown, a little remains.
+        A filter has only the newest state, and so no correlation with earlier ones. In directions in which the
+        covariance has not grown, a small share of it is returned.
         """
         now_T_then = self.motion_since(then_ns)
         if now_T_then is None:
@@ -133,7 +133,7 @@ class FilterEstimator:
         """Do nothing: the intervals between framesets have the samples."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
-        """Make a filter with a first state, at the newest position if there is one, which then ends the epoch."""
+        """Create a filter with a first state; if there is a state already, a new epoch begins at its position."""
         position = np.zeros(3)
         if self._filter is not None:
             self.epoch += 1
@@ -164,7 +164,7 @@ class FilterEstimator:
         self._poses.clear()
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
-        """Predict by constant velocity; the IMU since the frameset before is a measurement of the new state."""
+        """Predict by constant velocity; the IMU since the previous frameset is a measurement of the new state."""
         self.gate_results = {}
         config, dt = self._config.filter, (stamp_ns - self._latest_ns) * 1e-9
         is_gap = interval is None and dt > MAX_UNBRIDGED_S
@@ -178,7 +178,7 @@ class FilterEstimator:
         return is_gap
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
-        """Gate vision, gyro and accelerometer, and update with what passes; the paper has no zero-velocity update."""
+        """Gate vision, gyro and accelerometer, update with those that pass; the paper has no zero-velocity update."""
         motion, config = visual.motion, self._config.filter
         if motion is not None and motion.reference_stamp_ns != self._before_ns:
             if self._before_ns is not None and motion.reference_stamp_ns < self._before_ns:
@@ -210,7 +210,7 @@ class FilterEstimator:
         return MeasurementUpdate(motion)
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
-        """Reset the position's covariance, if it is time to, and keep the poses that motions are measured from."""
+        """Reset the position's covariance if that is due, and keep the poses from which motions are measured."""
         running = self._running
         if stamp_ns - self._reset_ns >= self._config.filter.reset_s * 1e9:
             self._reset_covariance = self._reset_covariance + running.reset_position(_RESET_SIGMA_M)
@@ -248,7 +248,7 @@ class FilterEstimator:
         pose[3:, :3] = body_R_nav @ covariance[POSITION, ATTITUDE]
         pose[:3, 3:] = pose[3:, :3].T
         pose[3:, 3:] = body_R_nav @ position @ body_R_nav.T
-        by_error = np.zeros((3, ERRORS))  # of the velocity in nav
+        by_error = np.zeros((3, ERRORS))  # Jacobian of the velocity in nav
         by_error[:, VELOCITY] = state.nav_R_body
         by_error[:, ATTITUDE] = -state.nav_R_body @ skew(state.velocity_body)
         velocity = by_error @ covariance @ by_error.T
@@ -265,7 +265,7 @@ class FilterEstimator:
         )
 
     def _inertial(self, rates: VisualRates | None) -> list[Measurement]:
-        """Return the gyro's and the accelerometer's measurements over the newest step, as far as they are used."""
+        """Return those of the gyro's and the accelerometer's measurements over the newest step that are used."""
         interval, config, state = self._interval, self._config.filter, self._running.state
         if interval is None:
             return []
@@ -278,7 +278,7 @@ class FilterEstimator:
         return measured
 
     def _passes_as_vision(self, motion: RelativeMotion, rates: VisualRates) -> bool:
-        """Whether vision passes the chi-square test and asks for no impossible acceleration."""
+        """Whether vision passes the chi-square test and implies no impossible acceleration."""
         state, config = self._running.state, self._config.filter
         accel = float(np.linalg.norm(rates.values[:3] - state.velocity_body)) / motion.duration_s
         sigma = np.sqrt(np.linalg.eigvalsh(self._running.covariance[VELOCITY, VELOCITY])[-1])
@@ -307,7 +307,7 @@ class FilterEstimator:
         self._status.is_lost, self._tracked_ns, self._refused_ns = False, stamp_ns, None
 
     def _reset_velocities(self) -> None:
-        """Make velocity and angular rate unknown, after a gap or a gate that was closed for long."""
+        """Make velocity and angular rate unknown, after a gap, or after the gate has refused vision for too long."""
         running = self._running
         for part, sigma in ((VELOCITY, _UNKNOWN_SPEED_SIGMA_M_S), (RATE, _UNKNOWN_RATE_SIGMA_RAD_S)):
             running.covariance[part, :] = running.covariance[:, part] = 0.0

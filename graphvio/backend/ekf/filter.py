@@ -20,7 +20,7 @@ class ExtendedKalmanFilter:
 
     Attributes:
         state: The estimate.
-        covariance: (15, 15) of its error, see `FilterState.plus`.
+        covariance: (15, 15) covariance of the estimate's error, see `FilterState.plus`.
     """
 
     state: FilterState
@@ -47,7 +47,7 @@ class ExtendedKalmanFilter:
         self.state = self.state.plus(gain @ measurement.innovation)
 
     def reset_position(self, sigma_m: float) -> Float:
-        """Reset the position's covariance up to its correlation with the other states.
+        """Reset the position's covariance, except for its correlation with the other states.
 
         Args:
             sigma_m: Standard deviation that remains.

@@ -25,7 +25,7 @@ class Measurement:
         name: Name of the sensor.
         innovation: (M,) measured minus expected value.
         by_error: (M, 15) measurement Jacobian H: derivative of the expected value with respect to the state's error.
-        covariance: (M, M) of the noise.
+        covariance: (M, M) covariance of the noise.
     """
 
     name: str
@@ -39,9 +39,9 @@ class VisualRates:
     """Velocity and angular rate by vision, each the mean over the step that ends in the state.
 
     Attributes:
-        values: (6,) ``[v, omega]``, m/s and rad/s, in body. Of v it is body at the beginning of the step; the paper's
+        values: (6,) ``[v, omega]``, m/s and rad/s, in body. v is in body at the beginning of the step; the paper's
             model compares it with the state's v, which is in body at the end.
-        covariance: (6, 6).
+        covariance: (6, 6) covariance of the values.
     """
 
     values: Float

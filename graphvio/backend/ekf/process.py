@@ -17,8 +17,8 @@ def noise_sigmas(dt: float, accel_sigma_m_s2: float, angular_accel_sigma_rad_s2:
 
     Args:
         dt: Time step, seconds.
-        accel_sigma_m_s2: Of the unknown acceleration, constant within a step.
-        angular_accel_sigma_rad_s2: Of the unknown angular acceleration.
+        accel_sigma_m_s2: Standard deviation of the unknown acceleration, constant within a step.
+        angular_accel_sigma_rad_s2: Standard deviation of the unknown angular acceleration.
         gyro_bias_walk: Random walk of the gyro bias, rad/s/sqrt(s) (= rad/s^2/sqrt(Hz)), as in `graphvio.rig.Imu`.
     """
     return np.repeat([accel_sigma_m_s2 * dt, angular_accel_sigma_rad_s2 * dt, gyro_bias_walk * np.sqrt(dt)], 3)

@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3, so3_exp, so3_log
 
 POSITION, ATTITUDE, VELOCITY, RATE, GYRO_BIAS = (slice(k, k + 3) for k in range(0, 15, 3))
-"""Parts of the error."""
+"""Slices of the error vector (15,)."""
 ERRORS = 15
 
 
@@ -38,7 +38,7 @@ class FilterState:
         return se3(self.nav_R_body, self.position)
 
     def plus(self, error: Float) -> FilterState:
-        """Return the state with an error (15,) with respect to this one; attitude's is a rotation vector in body."""
+        """Return this state with an error (15,) added; that of the attitude is a rotation vector in body."""
         return FilterState(
             self.position + error[POSITION],
             self.nav_R_body @ so3_exp(np.ascontiguousarray(error[ATTITUDE])),

@@ -1,4 +1,4 @@
-"""All numbers of a calibration as plain lists, in full precision, and as a YAML file."""
+"""Conversion of a calibration's numbers to plain lists, in full precision, and to a YAML file."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _pair(each: PairCalibration) -> dict[str, Any]:
 
 
 def _known(found: Calibration, j: int) -> dict[str, Any]:
-    """Single values, null where they are not determined."""
+    """Return offset and rotation of a pair as single values, None where they are not determined."""
     shown = found.pose_summary(j)
 
     def where_known(values: Float, known: Bool) -> list[float | None]:

@@ -17,7 +17,7 @@ _NS_PER_S = 1e9
 
 
 def alignment_errors(each: PairCalibration) -> Figure:
-    """Plot a histogram of alignment errors, as the paper's figure 4."""
+    """Plot a histogram of alignment errors, as in the paper's figure 4."""
     by_frame = len(each.frames) > 0
     errors = 1e3 * (each.frame_errors_m if by_frame else each.alignment_errors_m)
     inlier = each.frame_inlier if by_frame else each.inlier
@@ -80,7 +80,7 @@ def turning(each: PairCalibration) -> Figure:
 
 
 def growth(each: PairCalibration, count: int, unit: str) -> Figure:
-    """Plot the change of the result, with its sigmas, as the recording grew to its count of framesets or poses."""
+    """Plot the results from increasing parts of the recording, with sigmas, over the count of framesets or poses."""
     figure = empty_figure(6.4, 5.0)
     panels = [figure.add_axes((0.13, bottom, 0.83, 0.38)) for bottom in (0.57, 0.1)]
     begin, end = int(each.pairs.start_ns[0]), int(each.pairs.end_ns[-1])

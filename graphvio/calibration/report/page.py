@@ -1,4 +1,4 @@
-"""The report of a calibration: an HTML page for people, its figures, and all numbers."""
+"""The report of a calibration: an HTML page, its figures, and all numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_report(found: Calibration, folder: Path, source: str, count: int) -> P
 
     Args:
         found: the calibration.
-        folder: where to write; made if missing.
+        folder: folder for the report; created if missing.
         source: name of what was calibrated, for the title.
         count: number of framesets used, or of the first trajectory's poses.
 
@@ -55,7 +55,7 @@ def _pictures(each: PairCalibration, count: int, unit: str) -> dict[str, bytes]:
 
 
 def page(found: Calibration, pictures: dict[tuple[int, int], dict[str, bytes]], source: str) -> str:
-    """Render the page of what was calibrated, with PNGs by name of (first, second)."""
+    """Return the HTML page of a calibration; ``pictures`` maps (first, second) -> name -> PNG."""
     has_rig = found.rig is not None
     return render(
         "calibration/report/page.html",

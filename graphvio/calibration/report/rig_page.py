@@ -23,7 +23,7 @@ def rows_of(found: RecordedCalibration) -> list[tuple[str, ...]]:
 
 
 def agreement_in_words(each: HalfComparison) -> str:
-    """Say how well two halves agree in one group."""
+    """Return a sentence on the agreement of two halves in one group of parameters."""
     remark = "agree" if each.is_good else "do not agree"
     unit = f" {each.unit}" if each.unit else ""
     return (
@@ -33,7 +33,7 @@ def agreement_in_words(each: HalfComparison) -> str:
 
 
 def doubts_of(found: RecordedCalibration) -> list[str]:
-    """List what to know before the calibration is used."""
+    """Return sentences on what a user should know before using the calibration."""
     doubts = [f"kept as in the file, though the recording contradicts it: {each}" for each in found.contradicted]
     doubts += [agreement_in_words(each) for each in found.agreements if not each.is_good]
     for motion in dict.fromkeys(each.motion for each in found.findings):

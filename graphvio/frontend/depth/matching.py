@@ -21,16 +21,16 @@ _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `Ste
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 _PREDICTED_PX = 0.5
-_MIN_ALIKE = 0.75  # share of the new corners, below which epipolar lines beside those of the calibration are tried
+_MIN_ALIKE = 0.75  # share of new corners with a similar place on their epipolar lines; below it, others are tried
 _SHIFTS_PX = (-8.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 8.0)
-# Corners that look alike by chance are as many on any line, often half of them; how many more the shifted lines need,
-# absolutely, over the scatter of such a count, and over what those of the calibration have more.
+# Places that look like the corner by chance are as many on any line, often for half of the corners. How many more the
+# shifted lines need: in number, in sigmas of a count by chance, and over the excess of the calibration's lines.
 _MIN_MORE, _MIN_SIGMAS, _MIN_RATIO = 10, 5.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class StereoMatches:
-    """N left corners in the right image.
+    """Matches of N left corners in the right image.
 
     Attributes:
         right: (N, 2) normalised coordinates in the right image.
@@ -52,7 +52,7 @@ class StereoMatches:
 
 
 class TwoCameras(Protocol):
-    """Cameras between which is matched: a stereo pair, or others that see the same."""
+    """Two cameras between which corners are matched: a stereo pair, or others with overlapping views."""
 
     @property
     def left(self) -> Camera:
@@ -64,7 +64,7 @@ class TwoCameras(Protocol):
 
     @property
     def right_T_left(self) -> Float:
-        """Transform (4, 4) from one to the other."""
+        """Transform (4, 4) from the left to the right camera."""
 
 
 class StereoMatcher:
@@ -74,11 +74,11 @@ class StereoMatcher:
         self._pair = pair
         self._config = config
         self._allowed = allowed_right
-        self._margin_px = 0.0  # by how much the calibration may move epipolar lines
+        self._margin_px = 0.0  # by how much the calibration's epipolar lines may be off
         self._shift_px: Float = np.zeros(2)  # of all epipolar lines, where the images show that they are off
 
     def allow(self, allowed_right: Bool) -> None:
-        """Match only where (height, width) the newest right image may be used."""
+        """Set where (height, width) the newest right image may be used for matches."""
         self._allowed = allowed_right
 
     def recalibrate(self, pair: TwoCameras, epipolar_margin_px: float) -> None:
@@ -89,7 +89,7 @@ class StereoMatcher:
 
     @property
     def are_lines_off(self) -> bool:
-        """Whether corners are found beside the epipolar lines of the calibration."""
+        """Whether corners are matched on lines beside the epipolar lines of the calibration."""
         return bool(self._shift_px.any())
 
     def match(
@@ -109,8 +109,8 @@ class StereoMatcher:
             right: pyramid of the right image, of two levels at least.
             pixels: (N, 2) corners in the left image.
             rays: (N, 2) their normalised coordinates.
-            inverse_depths: (N,) expected, 1/m, NaN where unknown.
-            slopes: (N, 2) expected, zero where unknown.
+            inverse_depths: (N,) expected inverse depths, 1/m, NaN where unknown.
+            slopes: (N, 2) expected slopes, zero where unknown.
             min_gradient: smallest rms gradient of a right patch along its weaker direction, grey levels per pixel.
         """
         pair, settings = self._pair, self._config.stereo
@@ -187,8 +187,8 @@ class StereoMatcher:
     ) -> tuple[Float, Bool]:
         """Search corners (N,) along their epipolar lines: inverse depths (N,), and whether they were found (N,).
 
-        Where the calibration may be wrong and many lines have nothing that looks like the corner, lines that are
-        shifted are tried, and those that have clearly more are kept: until the next calibration.
+        If the calibration may be wrong and many lines have no place that looks like the corner, shifted lines are tried
+        as well. A shift with which clearly more lines have one is kept until the next calibration.
         """
         depths, found, alike = self._found_along(self._shift_px, left, right, pixels, rays, bounds)
         if not self._margin_px or alike.mean() >= _MIN_ALIKE:
@@ -212,7 +212,7 @@ class StereoMatcher:
     def _found_along(
         self, shift_px: Float, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, bounds: Float
     ) -> tuple[Float, Bool, Bool]:
-        """Search along lines that are shifted by (2,) pixels, see `epipolar_search`."""
+        """Search along epipolar lines that are shifted by (2,) pixels, see `epipolar_search`."""
         right_T_left, model, intrinsics, distortion = _projection(self._pair)
         shifted = intrinsics + np.concatenate([np.zeros(2), shift_px])
         return epipolar_search(
@@ -225,5 +225,5 @@ def _lens(camera: Camera) -> tuple[int, Float, Float]:
 
 
 def _projection(pair: TwoCameras) -> tuple[Float, int, Float, Float]:
-    """Return what projects points of the left camera into the right image."""
+    """Return transform, model, intrinsics and distortion that project points of the left camera to the right image."""
     return pair.right_T_left, *_lens(pair.right)

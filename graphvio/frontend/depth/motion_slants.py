@@ -1,7 +1,7 @@
-"""Slant of the surfaces that a single camera sees, from how a keyframe's patches look after a motion.
+"""Slant of the surfaces that a single camera sees, from the deformation of a keyframe's patches in later images.
 
 The keyframe and a later image are a stereo pair whose baseline is the motion: the patch of a slanted surface is sheared
-along the epipolar line. Where the slant is ignored, the shear is taken for a shift, in the same direction all over a
+along the epipolar line. If the slant is ignored, the shear is mistaken for a shift, in the same direction all over a
 wall.
 """
 
@@ -19,10 +19,10 @@ from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.frontend.imaging.sampling import pixel_words
 from graphvio.rig import Camera
 
-_MIN_PARALLAX_PX = 6.0  # by which depth moves a patch
-_MORE_PARALLAX = 1.5  # over that with which the keyframe's patch was measured before
+_MIN_PARALLAX_PX = 6.0  # shift of a patch that is due to its depth
+_MORE_PARALLAX = 1.5  # factor over the parallax with which the patch was measured before
 _TYPICAL_SLANT = 0.6  # tangent: standard deviation of each slope of a surface against the image
-_SLOPE_SIGMA = 0.02  # of a measured one, by which a patch is sheared
+_SLOPE_SIGMA = 0.02  # of a measured slope, by which a patch is sheared
 _VARIANCE_BY_STEREO = 0.1  # of a slant that another camera has measured, over that of an unknown one
 _MIN_CORRELATION = 0.9
 _MAX_SHIFT_PX = 0.3  # from where the patch was found before it was sheared
@@ -33,50 +33,50 @@ class MotionSlants:
     """Measures slants of a keyframe's patches in later images of the same camera.
 
     Args:
-        half: of the patches' side, without the middle.
-        step_px: of `graphvio.frontend.depth.prediction.around`.
+        half: half the side of the patches, which have ``2 half + 1`` pixels on each side.
+        step_px: step of `graphvio.frontend.depth.prediction.around`.
     """
 
     def __init__(self, half: int, step_px: float) -> None:
         self._half, self._step_px = half, step_px
         self._image: Image | None = None
         self._parallax_px: Float = np.zeros(0)  # with which each patch was measured last
-        self._variances: Float = np.zeros(0)  # of slants, over those of which nothing is known
+        self._variances: Float = np.zeros(0)  # of slants, over that of an unknown slant
 
     def begin(self, image: Image) -> None:
-        """Begin with another keyframe: its image (height, width)."""
+        """Begin with the image (height, width) of another keyframe."""
         self._image = image
         # so that the first measurement needs the smallest parallax
         self._parallax_px = np.full(len(self._variances), _MIN_PARALLAX_PX / _MORE_PARALLAX)
 
     def hand_on(self, before: Int, now: Int, n_tracks: int) -> None:
-        """Keep the variances of K tracks' slants, in rows (K,) before and now; the other slants are unknown."""
+        """Transfer the variances of K tracks' slants from rows (K,) before to rows now; other slants are unknown."""
         variances = np.ones(n_tracks)
         variances[now] = self._variances[before]
         self._variances = variances
 
     def note_measured(self, rows: Int) -> None:
-        """Take the slants of tracks, in rows (K,), for known: another camera has measured them."""
+        """Mark the slants of tracks, in rows (K,), as measured by another camera."""
         self._variances[rows] = _VARIANCE_BY_STEREO
 
     def measure(
         self, camera: Camera, keyframe: TrackedFrame, rows: Int, pixels: Float, image: Image, motion: Float,
         rays: Float, inverse_depths: Float,
     ) -> None:  # fmt: skip
-        """Improve inverse depths around the patches whose slant an image shows better than those before.
+        """Update inverse depths around the patches whose slant a new image shows better than earlier ones.
 
-        A slant that is measured with little parallax is noisier than a usual slant is large: it is weighed by its
-        variance.
+        With little parallax, the noise of a measured slant is larger than a usual slant: the measurement is weighted by
+        its variance.
 
         Args:
-            camera: of all images.
-            keyframe: tracks (N) of the keyframe.
-            rows: (M,) of the tracks that were found.
-            pixels: (M, 2) where.
-            image: (height, width).
-            motion: (4, 4) of points since the keyframe.
-            rays: (5, N, 2) around the tracks.
-            inverse_depths: (5, N), changed.
+            camera: the camera of all images.
+            keyframe: the N tracks of the keyframe.
+            rows: (M,) rows of the tracks that were found.
+            pixels: (M, 2) where they were found.
+            image: (height, width) the new image.
+            motion: (4, 4) motion of points since the keyframe.
+            rays: (5, N, 2) normalised coordinates around the tracks in the keyframe.
+            inverse_depths: (5, N) there, 1/m; updated in place.
         """
         if self._image is None or not len(rows):
             return
@@ -118,14 +118,14 @@ def hand_on_slants(rays: Float, inverse_depths: Float, motion: Float, new_rays: 
     """Compute inverse depths around tracks in a new keyframe, with the slants of the keyframe before.
 
     Args:
-        rays: (5, N, 2) normalised coordinates around the tracks before.
-        inverse_depths: (5, N) there.
-        motion: (4, 4) of points from one keyframe to the other.
-        new_rays: (5, N, 2) around the tracks in the new keyframe.
-        depths: (N,) inverse depths of the tracks there.
+        rays: (5, N, 2) normalised coordinates around the tracks in the keyframe before.
+        inverse_depths: (5, N) there, 1/m.
+        motion: (4, 4) motion of points from that keyframe to the new one.
+        new_rays: (5, N, 2) normalised coordinates around the tracks in the new keyframe.
+        depths: (N,) inverse depths of the tracks there, 1/m.
 
     Returns:
-        Inverse depths (5, N); a track's own all around it where the surface is seen from its edge.
+        Inverse depths (5, N); around a track whose surface is seen nearly edge-on, all equal to the track's own.
     """
     planes = _planes(rays, inverse_depths) @ motion[:3, :3].T
     planes /= 1.0 + (planes @ motion[:3, 3])[:, None]
@@ -136,7 +136,7 @@ def hand_on_slants(rays: Float, inverse_depths: Float, motion: Float, new_rays: 
 
 
 def _is_small(factors: Float) -> Bool:
-    """Check which slants (N,) are those of patches that still look alike: factors (5, N) of their inverse depths."""
+    """Check which slants (N,) are small enough for patches to look alike, by factors (5, N) on their inverse depths."""
     return np.asarray((np.abs(factors - 1.0) < _MAX_RELATIVE_SLANT).all(axis=0))
 
 

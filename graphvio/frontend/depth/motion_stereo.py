@@ -1,12 +1,12 @@
-"""Depth of a single camera's points from its motion, as triangulation has it for a pair.
+"""Depth of a single camera's points by triangulation over its motion.
 
-At each keyframe after the one at which a track began, its inverse depth is the least-squares solution of the rays of
-its first sight and of the newest one, for the motion that all cameras measured in between. Before there is any
-baseline a wide prior stands for the depth: such a point constrains the motion by its epipolar line only, as its
-covariance says.
+At each keyframe after the one at which a track began, its inverse depth is the least-squares solution for the rays of
+its first sight and of the newest one, given the motion that all cameras measured in between. Before there is any
+baseline, the depth has a wide prior: such a point constrains the motion by its epipolar line only, as its covariance
+expresses.
 
-The motion's error is common to all points, which a covariance for each of them cannot say: an unknown common scale
-takes its place where a motion is estimated by these points, see `graphvio.frontend.motion.depth_scale`.
+The motion's error is common to all points, which a separate covariance for each point cannot express: where a motion is
+estimated by these points, an unknown common scale stands for it, see `graphvio.frontend.motion.depth_scale`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ _DRIFT_PX2 = 1.0  # variance that a track's place gains from keyframe to keyfram
 _MAX_KEYFRAMES = 40
 _STEPS = 5
 _MIN_DEPTH_RATIO = 1e-3
-_MAX_DISTANCE = 25.0  # squared, in standard deviations: the point moves, or is another one
+_MAX_DISTANCE = 25.0  # squared, in standard deviations: beyond, the point moves, or is another one
 
 
 class Since(NamedTuple):
     """Motion from an earlier keyframe to the newest one.
 
     Attributes:
-        cur_T_then: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` from the left, in body now.
+        cur_T_then: (4, 4) motion of body.
+        covariance: (6, 6), tangent ``[rotation, translation]``, perturbation on the left, in body now.
         keyframes: number of keyframes from that one to the newest one.
     """
 
@@ -51,7 +51,7 @@ class MotionHistory:
         self.newest_ns: int | None = None
 
     def advance(self, then_ns: int, now_ns: int, cur_T_then: Float, covariance: Float) -> None:
-        """Add a keyframe, with the motion (4, 4) since another one and its covariance (6, 6)."""
+        """Add a keyframe at ``now_ns``, with the motion (4, 4) since another one and its covariance (6, 6)."""
         if then_ns != self.newest_ns:
             self.restart(then_ns)
         adjoint = se3_adjoint(np.ascontiguousarray(cur_T_then))
@@ -65,7 +65,7 @@ class MotionHistory:
         self._since = since | self._since
 
     def recalibrate(self, new_T_old: Float) -> None:
-        """Use another body frame (4, 4), in which the cameras' motions are the same and body's are others."""
+        """Change the body frame by a transform (4, 4): the cameras' motions stay the same, those of body change."""
         old_T_new, adjoint = se3_inverse(new_T_old), se3_adjoint(np.ascontiguousarray(new_T_old))
         self._since = {
             ns: Since(new_T_old @ each.cur_T_then @ old_T_new, adjoint @ each.covariance @ adjoint.T, each.keyframes)
@@ -73,7 +73,7 @@ class MotionHistory:
         }
 
     def restart(self, now_ns: int) -> None:
-        """Begin with a keyframe whose motion since the others is not known."""
+        """Begin again with a keyframe whose motion since the earlier ones is not known."""
         self._since = {now_ns: Since(np.eye(4), np.zeros((6, 6)), 0)}
         self.newest_ns = now_ns
 
@@ -83,7 +83,7 @@ class MotionHistory:
 
 
 class FirstSights:
-    """First sights of one camera's tracks, from which their depth is computed."""
+    """First sights of one camera's tracks: their rays at the keyframes from which their depths are triangulated."""
 
     def __init__(self) -> None:
         self._ids: Int = np.zeros(0, dtype=np.int64)
@@ -99,19 +99,19 @@ class FirstSights:
     def locate(
         self, ids: Int, rays: Float, history: MotionHistory, body_T_cam: Float, focal_px: float, sigma_px: float
     ) -> tuple[Float, Float]:
-        """Compute the points of a keyframe's tracks; tracks that have none begin here.
+        """Compute the points of a keyframe's tracks; for tracks without a first sight, this is the first one.
 
         Args:
-            ids: (N,) of the tracks, increasing.
+            ids: (N,) identities of the tracks, increasing.
             rays: (N, 2) their normalised coordinates.
-            history: with this keyframe as the newest one.
-            body_T_cam: (4, 4) of the camera.
-            focal_px: pixels per normalised image unit.
+            history: motion history with this keyframe as the newest one.
+            body_T_cam: (4, 4) pose of the camera.
+            focal_px: focal length, pixels per normalised image unit.
             sigma_px: pixel noise.
 
         Returns:
-            Points (N, 3) ``[x, y, 1/Z]`` and their covariances (N, 3, 3) for a pixel noise of 1 px, as
-            `graphvio.frontend.depth.stereo.triangulate` has them.
+            Points (N, 3) ``[x, y, 1/Z]`` and their covariances (N, 3, 3) for a pixel noise of 1 px, in the form of
+            `graphvio.frontend.depth.stereo.triangulate`.
         """
         assert history.newest_ns is not None
         stamps_ns, first = self._of_tracks(ids, rays, history)
@@ -131,7 +131,7 @@ class FirstSights:
         return points, covariances
 
     def _of_tracks(self, ids: Int, rays: Float, history: MotionHistory) -> tuple[Int, Float]:
-        """Return stamps (N,) and rays (N, 2) of the tracks' first sights: this keyframe where there is none."""
+        """Return stamps (N,) and rays (N, 2) of the tracks' first sights: those of this keyframe if there is none."""
         stamps_ns, first = np.full(len(ids), history.newest_ns, dtype=np.int64), rays.copy()
         if len(self._ids):
             rows = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
@@ -150,11 +150,11 @@ def _locate(
     """Compute points (N, 3), covariances (N, 3, 3), and which of them (N,) fit the motion; the others have the prior.
 
     Args:
-        rays: (N, 2) now.
+        rays: (N, 2) normalised coordinates now.
         first: (N, 2) normalised coordinates at the tracks' first sights.
-        which: (N,) number of the instant.
-        then_T_now: (A, 4, 4) of the camera, for each instant.
-        motion: (A, 6, 6) covariance of the motion in the camera's frame now, for a pixel noise of 1 px.
+        which: (N,) index of the instant of each track's first sight, among A instants.
+        then_T_now: (A, 4, 4) pose of the camera now, in the camera's frame at each instant.
+        motion: (A, 6, 6) covariance of the motion since then, in the camera's frame now, for a pixel noise of 1 px.
         drift: (A,) variance of the track's place, pixels squared.
         pixel: variance of a pixel in normalised coordinates.
         prior: variance of the inverse depth, for a pixel noise of 1 px.

@@ -1,4 +1,4 @@
-"""Prediction of tracks: where a motion puts points, and how it deforms their surroundings."""
+"""Prediction of tracks: the pixels of points after a motion, and the deformation of their patches."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ _RightCamera = tuple[Float, float, int, Float, Float]
 """right_T_left, the largest radius of the lens, model, intrinsics and distortion."""
 
 _NEARER = 0.01  # 1/m, a small step of inverse depth
-_BEND_STEP_PX = 4.0  # over which derivatives are compared: some half a patch
+_BEND_STEP_PX = 4.0  # over which derivatives are compared: about half a patch
 _MIN_AREA = 0.1  # a patch that has shrunk more than this is no longer comparable
 
 
@@ -25,8 +25,8 @@ def predict_pixels(
         inverse_depths: (N,) before, 1/m.
         motion: (4, 4) maps points before to points after.
         model: number of the camera's model.
-        intrinsics: (4,) of the camera.
-        distortion: (8,) of the camera.
+        intrinsics: (4,) ``fx, fy, cx, cy`` of the camera, pixels.
+        distortion: (8,) distortion coefficients of the camera.
 
     Returns:
         Pixels (N, 2), inverse depths (N,), and whether each point is in front of the camera (N,).
@@ -49,17 +49,17 @@ def predict_warps(
     """Predict how a motion deforms the surroundings of points.
 
     The affine map that is nearest to the deformation over a whole patch is not the one that is right at its centre:
-    the deformation's curvature shifts the patch as a whole. Along a wall that one walks by it has the same sign all
-    over, so that all points would seem to move too far.
+    the deformation's curvature shifts the patch as a whole. On a wall that the camera moves along, the curvature has
+    the same sign all over, so that all points would seem to move too far.
 
     Args:
         rays: (5, N, 2) normalised coordinates before, see `around`.
         inverse_depths: (5, N) of the surface there, 1/m: where they differ, the surface is slanted.
-        step_px: of `around`.
+        step_px: step of `around`.
         motion: (4, 4) maps points before to points after.
         model: number of the camera's model.
-        intrinsics: (4,) of the camera.
-        distortion: (8,) of the camera.
+        intrinsics: (4,) ``fx, fy, cx, cy`` of the camera, pixels.
+        distortion: (8,) distortion coefficients of the camera.
 
     Returns:
         Derivatives (N, 2, 2) of the pixel before with respect to the pixel after; halves of the second derivatives
@@ -98,18 +98,18 @@ def stereo_warps(
     left_model: int, left_intrinsics: Float, left_distortion: Float,
     right_model: int, right_intrinsics: Float, right_distortion: Float,
 ) -> tuple[Float, Float]:  # fmt: skip
-    """Compute how the right image shows the surroundings of points, as far as lenses and the cameras' rotation do it.
+    """Compute the deformation of points' surroundings in the right image by lenses and the cameras' rotation.
 
     Args:
         rays: (N, 2) normalised coordinates in the left camera.
         inverse_depths: (N,) of the points and their surroundings, 1/m.
-        right_T_left: (4, 4).
+        right_T_left: (4, 4) transform from the left to the right camera.
         left_model: number of the left camera's model.
-        left_intrinsics: (4,).
-        left_distortion: (8,).
+        left_intrinsics: (4,) ``fx, fy, cx, cy`` of the left camera, pixels.
+        left_distortion: (8,) distortion coefficients of the left camera.
         right_model: number of the right camera's model.
-        right_intrinsics: (4,).
-        right_distortion: (8,).
+        right_intrinsics: (4,) ``fx, fy, cx, cy`` of the right camera, pixels.
+        right_distortion: (8,) distortion coefficients of the right camera.
 
     Returns:
         Derivatives (N, 2, 2) of the right pixel with respect to the left one, and halves of its second derivatives
@@ -169,7 +169,7 @@ def _warp_at(x: float, y: float, w: float, ray_by_pixel: Float, camera: _RightCa
 
 
 def patch_deviation_px(half: int) -> float:
-    """Return the standard deviation of the pixels of a patch, ``2 half + 1`` on each side, along one of them."""
+    """Return the standard deviation of a pixel coordinate over a patch of ``2 half + 1`` pixels on each side."""
     return float(np.sqrt(half * (half + 1) / 3.0))
 
 
@@ -189,12 +189,12 @@ def inverse_depths_around(
     Args:
         rays: (5, N, 2) normalised coordinates in the left camera, see `around`.
         inverse_depths: (N,) of the points, 1/m.
-        slopes: (N, 2), see `graphvio.frontend.depth.slanted`.
-        step_px: of `around`.
-        right_T_left: (4, 4).
+        slopes: (N, 2) slopes of the disparity, see `graphvio.frontend.depth.slanted`.
+        step_px: step of `around`.
+        right_T_left: (4, 4) transform from the left to the right camera.
         model: number of the right camera's model.
-        intrinsics: (4,) of the right camera.
-        distortion: (8,) of the right camera.
+        intrinsics: (4,) ``fx, fy, cx, cy`` of the right camera, pixels.
+        distortion: (8,) distortion coefficients of the right camera.
 
     Returns:
         Inverse depths (5, N) of the surface's plane; the point's own where the right image does not show it.

@@ -1,9 +1,10 @@
 """Alignment of a left patch in the right image, where the surface that it shows may be slanted.
 
-Seen from two places, the patch of a slanted surface is sheared along the epipolar line: its disparity varies
-linearly over the patch. Two slopes in addition to the translation, and what lenses and the cameras' rotation do, make
-the alignment exact for any plane, to first order; what lenses do in second order shifts a patch by what its gradients
-see of it. Inverse compositional Gauss-Newton, as in `graphvio.frontend.imaging.lucas_kanade`.
+Seen from two places, the patch of a slanted surface is sheared along the epipolar line: its disparity varies linearly
+over the patch. With two slopes in addition to the translation, and with the deformation by lenses and the cameras'
+rotation, the alignment is exact for any plane, to first order. The second-order deformation by lenses shifts a patch by
+an amount that depends on its gradients, which is corrected. The method is inverse compositional Gauss-Newton, as in
+`graphvio.frontend.imaging.lucas_kanade`.
 """
 
 import numpy as np
@@ -15,11 +16,11 @@ from graphvio.frontend.imaging.sampling import PixelWords, Scratch, sample, samp
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
-_CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early would bias towards the depth of before
-_CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
-_CONVERGED_SHARE = 0.5  # of such a step that the next one may have, if steps go on getting shorter as they do
+_CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early would bias towards the earlier depth
+_CONVERGED_SLOPE = 0.003  # an earlier slope must be free to change, or its error would persist
+_CONVERGED_SHARE = 0.5  # of such a step: largest next step, extrapolated from how steps have become shorter
 _MAX_SLOPE = 0.8
-_SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
+_SLOPE_PRIOR = 100.0  # squared grey levels: noise of 3 grey levels over a slope of 0.3; decides without texture
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 _Columns = tuple[Patch, Patch, Patch, Patch]
@@ -36,17 +37,18 @@ def align_slanted(
     Args:
         left: image (height, width).
         right: image (height, width).
-        right_words: the right image as of `graphvio.frontend.imaging.sampling.pixel_words`.
+        right_words: the right image as returned by `graphvio.frontend.imaging.sampling.pixel_words`.
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) initial pixels in the right image.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
-        warps: (N, 2, 2) of surfaces at constant depth, see `graphvio.frontend.depth.prediction.stereo_warps`.
-        bends: (N, 2, 2) likewise.
-        slopes: (N, 2) initial slopes: derivative of the shift along the line with respect to the left pixel, of which
-            the slant is the cause.
-        known: (N,) whether guess and slopes are known from before; elsewhere the patch is first shifted alone.
+        warps: (N, 2, 2) derivatives of the right pixel with respect to the left one, of surfaces at constant depth, see
+            `graphvio.frontend.depth.prediction.stereo_warps`.
+        bends: (N, 2, 2) halves of the second derivatives, likewise.
+        slopes: (N, 2) initial slopes: derivative of the shift along the epipolar line with respect to the left pixel,
+            caused by the slant.
+        known: (N,) whether guess and slopes are known from before; if not, the shift is first aligned alone.
         wanted: (N,) which patches to align.
-        half: of the patch's side, without its middle.
+        half: half the side of the patches, which have ``2 half + 1`` pixels on each side.
 
     Returns:
         Pixels (N, 2) in the right image; slopes (N, 2); normalised cross-correlations there (N,); and whether each
@@ -83,7 +85,7 @@ def align_slanted(
                 if not is_exposed_alike:
                     _eliminate_contrast(columns, patch, normal.pp)
                 _factorise(columns, factor)
-            if is_exposed_alike:  # what is left of a difference would be taken for slopes
+            if is_exposed_alike:  # a remaining difference would be taken for slopes
                 gain = min(max(contrast, 1.0 / SAME_CONTRAST), SAME_CONTRAST)
             _project(columns, sheared, patch, gain, step)
             _solve(factor, step)
@@ -104,7 +106,7 @@ def align_slanted(
 
 @fast_kernel
 def _in_left_image(direction: Float, warp: Float) -> tuple[float, float]:
-    """Return which shift in the left image is a unit shift along the epipolar line in the right one."""
+    """Return the shift in the left image that corresponds to a unit shift along the epipolar line in the right one."""
     a, b, c, d = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
     area = a * d - b * c
     return (d * direction[0] - b * direction[1]) / area, (a * direction[1] - c * direction[0]) / area
@@ -131,7 +133,7 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
 
 @fast_kernel
 def _contrast(sheared: Patch, pp: float) -> float:
-    """Return the contrast of the image over that of the patch, given its square."""
+    """Return the contrast of the image over that of the patch, given the patch's sum of squares."""
     total = square = np.float32(0.0)
     values = sheared.flat
     for k in range(values.size):
@@ -143,7 +145,7 @@ def _contrast(sheared: Patch, pp: float) -> float:
 
 @fast_kernel
 def _eliminate_contrast(columns: _Columns, patch: Patch, pp: float) -> None:
-    """Make the derivatives orthogonal to the patch, given its square: another contrast then moves no parameter."""
+    """Make the derivatives orthogonal to the patch, given its sum of squares, so that contrast moves no parameter."""
     c0, c1, c2, c3, values = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat, patch.flat
     p0 = p1 = p2 = p3 = np.float32(0.0)
     for k in range(values.size):
@@ -234,7 +236,7 @@ def _compose(parameters: Float, step: Float, ex: float, ey: float, warp: Float) 
 
 @fast_kernel
 def _project(columns: _Columns, sheared: Patch, patch: Patch, gain: float, out: Float) -> None:
-    """Fill the derivatives times the difference of the patches (4,), the sheared one with its contrast taken off."""
+    """Fill the derivatives times the difference of the patches (4,), the sheared one divided by its contrast."""
     c0, c1, c2, c3 = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
     seen, expected = sheared.flat, patch.flat
     b0 = b1 = b2 = b3 = np.float32(0.0)

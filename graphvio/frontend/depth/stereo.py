@@ -15,8 +15,8 @@ from graphvio.kernels import fast_kernel, kernel, put
 
 HALF_PATCH = 5
 HALF_COARSE_PATCH = 4
-_MAX_STEPS = 400
-FINE_STEPS = 2  # of the half-sized image, to either side
+MAX_STEPS = 400  # of a search along an epipolar line
+FINE_STEPS = 2  # of the half-sized image, to either side of the best place there
 _AMBIGUOUS = 0.97
 _GAUSS_NEWTON_STEPS = 4
 _HALVINGS = 6
@@ -40,7 +40,7 @@ def epipolar_search(
 ) -> tuple[Float, Bool, Bool]:
     """Search the right image for each corner along its epipolar curve, to the pixel.
 
-    The curve is searched in images of half the size; the whole image then decides around the best place there.
+    The curve is searched in images of half the size; the best place is then refined in the images of full size.
 
     Args:
         left: image (height, width), and the same in half the size.
@@ -49,20 +49,21 @@ def epipolar_search(
         rays: (N, 2) their normalised coordinates.
         inverse_depths: (N, 2) range that is searched, 1/m; near ends that the right camera's lens does not reach are
             left out.
-        right_T_left: (4, 4).
+        right_T_left: (4, 4) transform from the left to the right camera.
         model: number of the right camera's model.
-        intrinsics: (4,) of the right camera.
-        distortion: (8,) of the right camera.
+        intrinsics: (4,) ``fx, fy, cx, cy`` of the right camera, pixels.
+        distortion: (8,) distortion coefficients of the right camera.
         min_correlation: smallest normalised cross-correlation.
 
     Returns:
-        Inverse depths (N,), 1/m, whether there is one clear best place (N,), and whether any place looks like it (N,).
+        Inverse depths (N,), 1/m; whether there is one clearly best place (N,); and whether any place looks like the
+        corner (N,).
     """
     n = len(pixels)
     depths = np.zeros(n)
     found, alike = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     coarse, fine = empty_patch(HALF_COARSE_PATCH), empty_patch(HALF_PATCH)
-    scores = np.empty(_MAX_STEPS + 1)
+    scores = np.empty(MAX_STEPS + 1)
     camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         x, y, w0, w1 = pixels[i, 0], pixels[i, 1], inverse_depths[i, 0], inverse_depths[i, 1]
@@ -99,7 +100,7 @@ def scan_curve(
     """Fill a patch's correlations along its epipolar curve, a pixel apart, in an image scaled by ``scale``.
 
     Returns:
-        Which is the best, and the number of steps, 0 where the curve's ends are not in the image plane.
+        Index of the best correlation, and the number of steps, 0 where the curve's ends are not in the image plane.
     """
     height, width = image.shape
     half = len(patch) // 2
@@ -107,7 +108,7 @@ def scan_curve(
     u1, v1, ok1 = _on_curve(ray, w1, camera)
     if not (ok0 and ok1):
         return 0, 0
-    steps = min(max(int(scale * np.hypot(u1 - u0, v1 - v0)) + 1, 2), _MAX_STEPS)
+    steps = min(max(int(scale * np.hypot(u1 - u0, v1 - v0)) + 1, 2), MAX_STEPS)
     best = 0
     for k in range(steps + 1):
         scores[k] = -1.0
@@ -123,7 +124,7 @@ def scan_curve(
 
 @kernel
 def is_ambiguous(scores: Float, best: int) -> bool:
-    """Check whether another place of the curve is as good as the best, as in a texture that repeats."""
+    """Check whether another place of the curve is nearly as good as the best, as in a texture that repeats."""
     for k in range(len(scores)):  # noqa: SIM110 (numba knows no generators)
         if abs(k - best) > FINE_STEPS and scores[k] > _AMBIGUOUS * scores[best]:
             return True
@@ -139,10 +140,10 @@ def epipolar_lines(
     Args:
         rays: (N, 2) normalised coordinates in the left camera.
         inverse_depths: (N,) 1/m.
-        right_T_left: (4, 4).
+        right_T_left: (4, 4) transform from the left to the right camera.
         model: number of the right camera's model.
-        intrinsics: (4,) of the right camera.
-        distortion: (8,) of the right camera.
+        intrinsics: (4,) ``fx, fy, cx, cy`` of the right camera, pixels.
+        distortion: (8,) distortion coefficients of the right camera.
 
     Returns:
         Pixels (N, 2), the directions (N, 2) in which they move when they come nearer, and whether both exist (N,).
@@ -171,9 +172,9 @@ def triangulate(
     Args:
         left: (N, 2) normalised coordinates.
         right: (N, 2) normalised coordinates.
-        right_T_left: (4, 4).
-        focal_left: pixels, weighs the left image.
-        focal_right: pixels, weighs the right image.
+        right_T_left: (4, 4) transform from the left to the right camera.
+        focal_left: focal length, pixels; the weight of the left image.
+        focal_right: focal length, pixels; the weight of the right image.
 
     Returns:
         Points (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, their covariances (N, 3, 3) per px^2, and the
@@ -236,7 +237,7 @@ def _invert_symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz:
 
 @kernel
 def _on_curve(ray: Float, w: float, camera: _Camera) -> tuple[float, float, bool]:
-    """Project a ray's point of some inverse depth into the right image; False beyond the camera's model."""
+    """Project the point of a ray at an inverse depth into the right image; False beyond the camera's model."""
     r, model, intrinsics, distortion, limit = camera
     z = r[2, 0] * ray[0] + r[2, 1] * ray[1] + r[2, 2] + w * r[2, 3]
     if z < 1e-3:

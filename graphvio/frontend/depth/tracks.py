@@ -1,4 +1,4 @@
-"""Observations of one stereo pair or single camera at one instant: its tracks, as columns."""
+"""Observations of one stereo pair or single camera at one instant: its tracks, as arrays with one row per track."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graphvio.frontend.depth.stereo import triangulate
 from graphvio.kernels import kernel
 from graphvio.rig import CameraGroup, SingleCamera
 
-_NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
+_NEAR_SIGMAS = 10.0  # inverse depth over its standard deviation, of a depth known to a tenth
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +21,8 @@ class TrackedFrame:
     """Observations of one pair, or of one single camera, at one instant: N tracks.
 
     Attributes:
-        stamp_ns: of the frameset.
-        ids: (N,) identities, increasing.
+        stamp_ns: stamp of the frameset.
+        ids: (N,) identities of the tracks, increasing.
         ages: (N,) number of frames before this one in which the track was seen.
         pixels: (N, 2) in the left image.
         left_rays: (N, 2) normalised coordinates in the left image.
@@ -30,16 +30,16 @@ class TrackedFrame:
         right_pixels: (N, 2) in the right image; meaningful where ``has_depth``.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.depth.stereo`.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
-        slopes: (N, 2) derivative of the disparity with respect to the left pixel (u, v) over the patch, as the slant of
-            the surface makes it, see `graphvio.frontend.depth.slanted`; meaningful where ``has_depth``.
+        slopes: (N, 2) derivative of the disparity with respect to the left pixel (u, v) over the patch, caused by the
+            slant of the surface, see `graphvio.frontend.depth.slanted`; meaningful where ``has_depth``.
         has_depth: (N,) whether the stereo match passed all its tests.
         frames_without_depth: (N,) number of frames since the last valid stereo match, 0 where this one has it.
         is_single: whether the camera has no partner: every track has a depth, though it may be next to unknown.
         rejected: test of tracking or stereo matching -> number of tracks that failed it.
-        stage_ms: time by stage.
-        shutter_px: (N, 2, 2) to be added to the pixels in the left and in the right image for where a global shutter
-            would have seen the points at the stamp; normalised coordinates and points are as of there. Zero if not
-            given.
+        stage_ms: processing time by stage, milliseconds.
+        shutter_px: (N, 2, 2) offsets from the pixels in the left and in the right image to where a global shutter would
+            have seen the points at the stamp; normalised coordinates and points are those at the offset pixels. Zero if
+            not given.
     """
 
     stamp_ns: int
@@ -79,7 +79,7 @@ class TrackedFrame:
         return np.zeros(len(self.ids), dtype=bool) if self.is_single else self.has_depth
 
     def constrains_translation(self, sigma_px: float) -> Bool:
-        """Select the tracks (N,) so near that their motion constrains more than rotation, for a pixel noise."""
+        """Select the tracks (N,) that are near enough to constrain translation, for a pixel noise in pixels."""
         sigma_w = sigma_px * np.sqrt(self.covariances[:, 2, 2])
         return np.asarray(self.has_depth & (self.points[:, 2] > _NEAR_SIGMAS * sigma_w))
 
@@ -103,7 +103,7 @@ class TrackedFrame:
         )
 
     def recalibrated(self, group: CameraGroup) -> TrackedFrame:
-        """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
+        """Return the frame for another calibration of its cameras: the same pixels, triangulated again."""
         rays, has_ray = group.left.unproject(self.pixels_at_stamp)
         if isinstance(group, SingleCamera):
             points = np.column_stack([rays, self.points[:, 2]])
@@ -146,7 +146,7 @@ def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
 
 @kernel
 def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
-    """Find the identities common to two increasing columns (N,) and (M,): their rows in each (K,)."""
+    """Find the K identities common to two increasing arrays (N,) and (M,); return their rows (K,) in each."""
     at_first = np.empty(min(len(first), len(second)), dtype=np.int64)
     at_second = np.empty_like(at_first)
     i = j = k = 0
@@ -163,12 +163,12 @@ def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
 
 @kernel
 def usable_at(pixels: Float, allowed: Bool, border_px: float) -> tuple[Bool, Bool]:
-    """Check which pixels (N, 2) lie so far inside the image (N,), and which of these may be used (N,).
+    """Check which pixels (N, 2) are inside the image with a border (N,), and which of these may be used (N,).
 
     Args:
-        pixels: NaN is outside.
+        pixels: (N, 2); NaN counts as outside.
         allowed: (height, width) where the image may be used.
-        border_px: distance from the edge.
+        border_px: smallest distance from the image's edge.
     """
     height, width = allowed.shape
     inside, usable = np.zeros(len(pixels), dtype=np.bool_), np.zeros(len(pixels), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Matching between cameras that look different ways: patches are warped as the other camera would see them."""
+"""Matching between cameras that point in different directions: patches are warped as the other camera sees them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from graphvio.frontend.depth.stereo import (
     FINE_STEPS,
     HALF_COARSE_PATCH,
     HALF_PATCH,
+    MAX_STEPS,
     empty_patch,
     epipolar_lines,
     is_ambiguous,
@@ -34,14 +35,14 @@ _MAX_PARALLAX_RAD = 0.2  # between the rays of both cameras; beyond it errors ar
 
 
 class WarpedMatcher(StereoMatcher):
-    """Matcher of one camera's corners in another that may look any other way.
+    """Matcher of one camera's corners in another one that may point in any direction.
 
-    A patch is warped by the cameras' rotation to each other and their lenses, as of a surface that faces the camera.
-    Points that are so near that the cameras see them from too different directions are left out.
+    A patch is warped by the cameras' relative rotation and their lenses, for a surface that faces the camera. Points
+    that are so near that the cameras see them from too different directions are left out.
 
     Args:
-        pair: the camera that has the corners, and the other one.
-        config: of all stages.
+        pair: the camera that has the corners as the left one, and the other one.
+        config: configuration of all stages.
     """
 
     def __init__(self, pair: TwoCameras, config: Config) -> None:
@@ -70,7 +71,7 @@ class WarpedMatcher(StereoMatcher):
             )
         warps, bends, usable = predict_warps(rays_beside, np.tile(expected, (5, 1)), step_px, *camera)
         guess, _, in_reach = epipolar_lines(rays, expected, *camera)
-        # A surface that does not face the camera looks the more unlike its patch, the more the directions differ.
+        # A surface that does not face the camera looks less like its patch the more the viewing directions differ.
         is_alike = float(np.linalg.norm(pair.right_T_left[:3, 3])) * expected < _MAX_PARALLAX_RAD
         found = passes(np.ones(len(pixels), dtype=bool), seen & usable & in_reach & is_alike, "search", rejected)
         matched, registered, localised, correlations = register(
@@ -90,22 +91,22 @@ def _warped_search(
 
     Args:
         left: image (height, width), and the same in half the size.
-        right: likewise.
+        right: image (height, width), and the same in half the size.
         pixels: (N, 2) corners in the left image.
         rays: (N, 2) their normalised coordinates.
         warps: (N, 2, 2) derivative of the left pixel with respect to the right pixel.
         nearest: largest inverse depth, 1/m.
-        right_T_left: (4, 4).
+        right_T_left: (4, 4) transform from the left to the right camera.
         model: number of the right camera's model.
-        intrinsics: (4,) of the right camera.
-        distortion: (8,) of the right camera.
+        intrinsics: (4,) ``fx, fy, cx, cy`` of the right camera, pixels.
+        distortion: (8,) distortion coefficients of the right camera.
 
     Returns:
         Inverse depths (N,), 1/m, and whether there is one clear best place (N,).
     """
     n = len(pixels)
     depths, found = np.zeros(n), np.zeros(n, dtype=np.bool_)
-    coarse, fine, scores = empty_patch(HALF_COARSE_PATCH), empty_patch(HALF_PATCH), np.empty(401)
+    coarse, fine, scores = empty_patch(HALF_COARSE_PATCH), empty_patch(HALF_PATCH), np.empty(MAX_STEPS + 1)
     camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         x, y, w0 = pixels[i, 0], pixels[i, 1], 0.0

@@ -1,7 +1,7 @@
-"""Alignment of patches: the shift of an image at which it shows a patch.
+"""Alignment of a patch with an image: estimation of the place in the image that shows the patch.
 
-Gauss-Newton, whose gradients and normal matrix belong to the patch (inverse compositional, S. Baker, I. Matthews,
-*Lucas-Kanade 20 years on*, IJCV 56(3), 2004).
+The method is Gauss-Newton, whose gradients and normal matrix belong to the patch (inverse compositional, S. Baker,
+I. Matthews, *Lucas-Kanade 20 years on*, IJCV 56(3), 2004).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from graphvio.kernels import fast_kernel
 SAME_CONTRAST = 1.25
 """Largest ratio of contrasts of images that are exposed alike."""
 
-_MIN_CONTRAST, _MAX_CONTRAST = 0.4, 2.5  # of an image over that of a patch, as far as it is believed
+_MIN_CONTRAST, _MAX_CONTRAST = 0.4, 2.5  # limits of an image's contrast over that of a patch
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken, after which the error is several times smaller
 _ZERO = np.float32(0.0)
@@ -24,7 +24,7 @@ _ZERO = np.float32(0.0)
 def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, float, bool]:
     """Sum gradients and patch times the difference between the image at (u, v) and the patch; False outside the image.
 
-    All three have zero mean, so a constant difference of brightness contributes nothing.
+    The gradients and the patch have zero mean, so that a constant difference of brightness contributes nothing.
     """
     height, width = image.shape
     side, stride = patch.rows.shape
@@ -64,8 +64,8 @@ def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patc
 def different_contrast(ratio: float) -> float:
     """Return the contrast of an image over that of a patch, or 1 where they are nearly the same.
 
-    To estimate it costs precision, which is lost for nothing where both images are exposed alike: a patch that is seen
-    larger, or slanted otherwise, seems to have another contrast, too.
+    Estimating it costs precision, for nothing where both images are exposed alike: a patch that is seen larger, or at
+    another slant, also seems to have another contrast.
     """
     if 1.0 / SAME_CONTRAST < ratio < SAME_CONTRAST:
         return 1.0
@@ -105,15 +105,15 @@ def align(
 
 @fast_kernel
 def shift_by_bends(gx: Patch, gy: Patch, grid: Lattice, normal: NormalEquations, bends: Float) -> tuple[float, float]:
-    """Compute by how much an alignment is off where an affine map leaves out second derivatives.
+    """Compute by how much an alignment is off because an affine map leaves out second derivatives.
 
-    Mixed ones are left out: they shift patches whose gradients lie along a diagonal, in either direction.
+    Mixed second derivatives are left out: they shift patches whose gradients lie along a diagonal, in either direction.
 
     Args:
         gx: the patch's gradient along its rows.
-        gy: along its columns.
-        grid: of the patch.
-        normal: its normal equations.
+        gy: the patch's gradient along its columns.
+        grid: lattice of the patch.
+        normal: normal equations of the patch.
         bends: (2, 2) half of the second derivative along the rows, and along the columns, 1/px.
     """
     dx, dy, xs, ys = gx.flat, gy.flat, grid.columns.flat, grid.rows.flat

@@ -25,7 +25,7 @@ def occupied_cells(pixels: Float, cell_px: int, rows: int, columns: int) -> Bool
 
 @kernel
 def thinned(pixels: Float, found: Bool, cell_px: int, most: int) -> Bool:
-    """Select (N,) the found tracks that stay where several share a cell: the first ones of each, at most ``most``."""
+    """Select the found tracks (N,) that are kept: of each cell, only the first ``most``."""
     keep = np.zeros(len(pixels), dtype=np.bool_)
     rows = columns = 1
     for i in np.flatnonzero(found):
@@ -46,7 +46,7 @@ def find_corners(
     """Find the strongest Harris corner of each cell that no track occupies, to sub-pixel precision.
 
     Args:
-        image: (height, width).
+        image: (height, width) the image.
         allowed: (height, width), False where the image must not be used.
         tracked: (N, 2) pixels that are tracked already; a new corner keeps half a cell of distance to them.
         occupying: (N,) which of them occupy their cell, so that it gets no other corner.
@@ -106,7 +106,7 @@ def _harris(
     """Fill the Harris response, and the mean square gradient along the weaker direction, from pixel (x0, y0) on.
 
     Sums over the window's columns are carried from row to row; all numbers in them are exact in single precision. Loops
-    go on to a multiple of what vector instructions take at once, since rows are short; what is beyond means nothing.
+    go on to a multiple of what vector instructions take at once, since rows are short; numbers beyond are meaningless.
     """
     area = np.float32((2 * _RADIUS + 1) ** 2)
     half, k = np.float32(0.5), np.float32(_HARRIS_K)
@@ -212,7 +212,7 @@ def _distance2(pixels: Float, x: float, y: float) -> float:
 
 @kernel
 def _is_peak(response: AnyArray, x: int, y: int) -> bool:
-    """Check that no neighbour is greater, as it is on the slope towards a corner of the next cell."""
+    """Check that no neighbour is greater, as one would be on the slope towards a corner of the next cell."""
     for j in range(-1, 2):
         for i in range(-1, 2):
             if response[y + j, x + i] > response[y, x]:

@@ -15,9 +15,10 @@ class Frozen:
     """Repeated images of a frameset.
 
     Attributes:
-        pairs: Pairs of which a camera repeats its image while another pair's cameras or its partner do not.
-        all_since_ns: Stamp since which every image is the same, or None; so it is at a standstill without image noise.
-        reason: One line for people.
+        pairs: Pairs with a camera that repeats its image while its partner or another pair's cameras do not.
+        all_since_ns: Stamp since which every image is the same, or None. A standstill without image noise looks the
+            same.
+        reason: Description in one line, or empty.
     """
 
     pairs: frozenset[int]
@@ -26,7 +27,7 @@ class Frozen:
 
 
 class FrozenImages:
-    """Compares each image with the one before it, byte for byte: the noise of a sensor changes every image."""
+    """Detects repeated images by comparing each with the one before, byte for byte: noise changes every real image."""
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[Image, ...]] = {}
@@ -50,7 +51,7 @@ class FrozenImages:
         return Frozen(stuck, None, f"pairs {sorted(stuck)} repeat an image" if stuck else "")
 
     def _others_changed(self, frameset: FrameSet) -> bool:
-        """Whether pairs that are triggered at other times have seen something new since these pairs' last images."""
+        """Return whether pairs that are not in this frameset had new images since the last images of those that are."""
         since_ns = min((self._seen_ns.get(j, frameset.stamp_ns) for j in frameset.images), default=0)
         return any(
             seen_ns > since_ns and self._changed_ns.get(j) == seen_ns

@@ -1,8 +1,8 @@
-"""Image noise: how large it is against what an image shows, and smoothing while it is too large.
+"""Measurement of image noise, and smoothing of images while the noise is too large for their contrast.
 
-Patches that are mostly noise look like nothing in another image: tracks still survive, since they are searched where
-they are predicted, but few corners are found along their epipolar lines. Smoothed by a pixel they are found again.
-Clean images are left alone, since smoothing costs sharp ones precision.
+Patches that are mostly noise resemble nothing in another image: tracks still survive, since they are searched for where
+they are predicted, but few corners are found along their epipolar lines. After smoothing by about a pixel, they are
+found again. Clean images are not smoothed, since this costs sharp ones precision.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ _QUANTILE = 0.5
 _STEP = 6  # pixels and rows from one sample of the noise to the next
 _MAX_RESPONSE = 2047
 _BLOCK_PX, _BLOCK_STEP = 16, 2
-_MAX_TEXTURED = 0.25  # of the blocks: corners lie in these
+_MAX_TEXTURED = 0.25  # share of textured blocks, in which corners lie
 _MIN_TO_SMOOTH, _MIN_TO_GO_ON = 0.2, 0.15  # noise over contrast; sharp images have less than 0.1
 _SMOOTHING_PX = 0.8
 _SMOOTHED = 0.315  # gradients of white noise after the smoothing, over those before
-_ROUNDING = float(1.0 / np.sqrt(12.0))  # to whole grey levels
+_ROUNDING = float(1.0 / np.sqrt(12.0))  # sigma of rounding to whole grey levels
 
 
 class NoiseFilter:
-    """Smooths images of the cameras of one pair while their noise is large against what they show.
+    """Smooths images of the cameras of one pair while their noise is large compared with their contrast.
 
     Attributes:
         left_sigma: noise of the newest left image as it was returned: standard deviation, grey levels, of white noise
@@ -38,11 +38,11 @@ class NoiseFilter:
         self._is_smoothing = False
 
     def filtered(self, left: Image, right: Image | None) -> tuple[Image, Image | None]:
-        """Return the images, smoothed alike if the noise of one of them asks for it.
+        """Return the images, both smoothed if the noise of either one is too large for its contrast.
 
         Args:
-            left: (height, width), or the image of a single camera.
-            right: (height, width), or None.
+            left: left image (height, width), or the image of a single camera.
+            right: right image (height, width), or None.
         """
         largest = _MIN_TO_GO_ON if self._is_smoothing else _MIN_TO_SMOOTH
         self.left_sigma = noise_sigma(left)
@@ -61,11 +61,13 @@ def _smoothed(image: Image) -> Image:
 
 @kernel
 def has_less_contrast(image: Image, sigma: float) -> bool:
-    """Whether grey levels deviate by less in blocks of 16 pixels, but for a quarter of them, which may be textured.
+    """Return whether an image has less contrast than a limit in blocks of 16 x 16 pixels.
+
+    Up to a quarter of the blocks may have more: these may be textured.
 
     Args:
-        image: (height, width).
-        sigma: standard deviation of the grey levels within a block.
+        image: (height, width) the image.
+        sigma: limit, a standard deviation of the grey levels within a block.
     """
     height, width = image.shape
     rows, columns, count = height // _BLOCK_PX, width // _BLOCK_PX, (_BLOCK_PX // _BLOCK_STEP) ** 2

@@ -14,11 +14,11 @@ from graphvio.rig import Camera, Rig
 
 
 def checked(frameset: FrameSet, rig: Rig) -> FrameSet:
-    """Return the frameset with contiguous images.
+    """Check the images and masks of a frameset, and return it with contiguous images.
 
     Raises:
         RigError: if an image or its mask is not of the type and size that the rig says, or a group has another number
-            of them.
+            of them than of cameras.
     """
     checked_images, masks = {}, {}
     for j, images in frameset.images.items():
@@ -60,9 +60,9 @@ def _checked_mask(mask: AnyArray | None, camera: Camera) -> Image | None:
 
 
 def pixels_with_ray(camera: Camera) -> Bool:
-    """Return which pixels (height, width) have a ray: not those beyond the domain of a lens.
+    """Return which pixels (height, width) have a ray: not those beyond the domain of the lens model.
 
-    Of most lenses all have one, which those at the image's edge show.
+    With most lenses, all pixels have one; it is then enough to check the pixels at the image's edge.
     """
     width, height = camera.size_px
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
@@ -78,12 +78,12 @@ not used, or None to use all of the image. It is called from several threads."""
 
 
 class UsablePixels:
-    """Where points of a camera's images may be: where all pixels of their patch have a ray, and none is masked.
+    """Pixels at which points of a camera may be: where all pixels of their patch have a ray, and none is masked.
 
     Args:
-        camera: with a mask that is the same for all images, or without.
+        camera: the camera, with a mask that is the same for all images, or without.
         window_px: side of the patches.
-        image_mask: masks of each image, or None.
+        image_mask: function that makes a mask for each image, or None.
 
     Attributes:
         always: (height, width) where points may be by the camera's lens and its own mask.
@@ -115,8 +115,8 @@ class UsablePixels:
         """Return where (height, width) points of an image may be.
 
         Args:
-            image: (height, width).
-            mask: (height, width) that came with it, whose zeros are not used, or None.
+            image: (height, width) the image.
+            mask: (height, width) mask that came with it, whose zeros are not used, or None.
 
         Raises:
             RigError: if the mask that the function makes has another size.

@@ -34,7 +34,7 @@ _MAX_SIGMA_PX = 0.2
 """Largest standard deviation of a place along the weaker direction; sharp images have less than half of it."""
 
 Pyramid = tuple[Image, ...]
-"""An image and its halves, quarters..."""
+"""An image, and the same image at half the size, a quarter of the size, and so on."""
 
 
 def build_pyramid(image: Image, levels: int) -> Pyramid:
@@ -60,9 +60,9 @@ def track(
     """Track corners from one image to another and, as a check, back again.
 
     Args:
-        source: of the image that holds the corners.
-        target: of the image to find them in.
-        pixels: (N, 2) corners.
+        source: pyramid of the image that holds the corners.
+        target: pyramid of the image to find them in.
+        pixels: (N, 2) corners in the source.
         guess: (N, 2) initial pixels in the target.
         window_px: side of the patch that is compared, odd.
         levels: pyramid levels that are used, 1 for the image alone.
@@ -71,7 +71,8 @@ def track(
         first_levels: levels that are tried first, where the guess is good; tracks that fail are tried again with all.
 
     Returns:
-        Pixels (N, 2) and whether each was found (N,), also to a sigma of 0.2 px along its weaker direction.
+        Pixels (N, 2) and whether each was found (N,), which includes that its sigma along the weaker direction is at
+        most 0.2 px.
     """
     half = window_px // 2
     few = levels if first_levels is None else min(first_levels, levels)
@@ -128,23 +129,23 @@ def register(
     """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
 
     Args:
-        source: image that holds the patches, as of `graphvio.frontend.imaging.sampling.pixel_words`.
+        source: image that holds the patches, as returned by `graphvio.frontend.imaging.sampling.pixel_words`.
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel with respect to the target pixel.
         bends: (N, 2, 2) half of the second derivative of the target pixel along the rows of the source, and along its
             columns, 1/px. Their effect is computed as if the patch's pixels were as far apart in both images.
-        guess: (N, 2) in the target.
+        guess: (N, 2) initial pixels in the target.
         wanted: (N,) which patches to find.
-        half: of the patch's side, without its middle.
+        half: half the side of the patches, which have ``2 half + 1`` pixels on each side.
         max_shift_px: largest distance from the guess.
         min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
         is_other_camera: whether the images are of two cameras, which may be exposed differently.
 
     Returns:
-        Pixels (N, 2), equal to the guess where not found; whether each was found (N,), also to a sigma of 0.2 px along
-        its weaker direction; whether its patch is in the source and has that gradient (N,); and the normalised
-        cross-correlations at the places found (N,).
+        Pixels (N, 2), equal to the guess where not found; whether each was found (N,), which includes that its sigma
+        along the weaker direction is at most 0.2 px; whether its patch is in the source and has ``min_gradient`` (N,);
+        and the normalised cross-correlations at the places found (N,).
     """
     n = len(pixels)
     moved, correlations = guess.copy(), np.full(n, -1.0)

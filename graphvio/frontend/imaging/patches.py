@@ -1,8 +1,8 @@
-"""Square patches of an image, and how much they resemble each other.
+"""Square patches of an image: their storage, gradients and correlation.
 
 A patch of ``2 half + 1`` pixels on each side has rows that are padded with zeros to a multiple of `LANES`: loops over
-its pixels then run in whole vector registers, and the padding of the image that it is compared with has no weight. One
-with a border, from which gradients are computed, has rows without padding, or it would be half padding.
+its pixels then run in whole vector registers, and pixels of the compared image beyond a row have no weight. A patch
+with a border, from which gradients are computed, has rows without padding, which would be half of it.
 """
 
 from typing import NamedTuple
@@ -37,8 +37,8 @@ class Lattice(NamedTuple):
     """Coordinates of the pixels of all patches of one size.
 
     Attributes:
-        columns: counted from the middle.
-        rows: counted from the middle.
+        columns: column of each pixel, counted from the middle.
+        rows: row of each pixel, counted from the middle.
         inside: 1 for the patch's own pixels, 0 for the padding.
     """
 
@@ -57,7 +57,7 @@ def room(half: int) -> Patch:
 
 @fast_kernel
 def bordered_room(half: int) -> Patch:
-    """Allocate a patch with one more pixel on each side, all zero: rows without padding, and a register behind them."""
+    """Allocate a patch with one more pixel on each side, all zero: rows without padding, and a register at the end."""
     side = 2 * half + 3
     flat = np.zeros((side * side + 2 * LANES - 1) // LANES * LANES, dtype=np.float32)
     return Patch(flat[: side * side].reshape((side, side)), flat)
@@ -84,12 +84,12 @@ def _filled(grid: Lattice, half: int) -> Lattice:
 
 
 class NormalEquations(NamedTuple):
-    """What a patch has for its alignment in an image of another brightness and contrast, apart from the image.
+    """Sums over a patch, independent of the image, for its alignment in images of other brightness and contrast.
 
     Attributes:
-        xx: Of the normal matrix of the shift.
-        xy: Likewise.
-        yy: Likewise.
+        xx: Gradient along the rows squared, summed: an element of the shift's normal matrix.
+        xy: Gradient along the rows times that along the columns, summed; likewise.
+        yy: Gradient along the columns squared, summed; likewise.
         px: Gradient along the rows times the patch, summed.
         py: Gradient along the columns times the patch, summed.
         pp: The patch times itself, summed.
@@ -108,11 +108,11 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
     """Fill a patch and its gradients, all of zero mean, and return its normal equations.
 
     Args:
-        bordered: the patch with one more pixel on each side, as of `bordered_room`.
-        inside: of the patch's `Lattice`.
-        patch: output.
-        gx: output, along the rows.
-        gy: output, along the columns.
+        bordered: the patch with one more pixel on each side, as allocated by `bordered_room`.
+        inside: field of the patch's `Lattice`.
+        patch: output, the patch without the border.
+        gx: output, the gradient along the rows.
+        gy: output, the gradient along the columns.
     """
     side, stride = patch.rows.shape
     pitch = side + 2
@@ -178,13 +178,13 @@ def correlation(patch: Patch, other: Patch) -> float:
 def localisation2(patch: Patch, other: Patch, normal: NormalEquations) -> float:
     """Compute the variance of a patch's place in an image along the weaker direction, square pixels.
 
-    Differences between patch and image other than contrast and brightness are taken for white noise. A blurred image
-    leaves a place free along the blur: an iteration that begins there ends there.
+    Differences between patch and image other than contrast and brightness are taken for white noise. In a blurred
+    image, the place along the blur is not determined: an iteration ends where it begins.
 
     Args:
-        patch: of zero mean.
+        patch: the patch, of zero mean.
         other: the image at the patch's place, of zero mean.
-        normal: of ``other``.
+        normal: normal equations of ``other``.
     """
     a, b = patch.flat, other.flat
     product = own = square = _ZERO

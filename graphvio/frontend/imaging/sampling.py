@@ -1,4 +1,4 @@
-"""Images between their pixels: patches sampled by a cubic B-spline, at any place and deformed by any linear map.
+"""Sub-pixel sampling: patches of an image by a cubic B-spline, at any place and deformed by any linear map.
 
 The pixels are the spline's coefficients (M. Unser, *Splines: a perfect fit for signal and image processing*, IEEE
 Signal Processing Magazine 16(6), 1999): it smooths by 0.58 pixels, wherever between the pixels a place lies. Bilinear
@@ -25,7 +25,7 @@ class Scratch(NamedTuple):
     """Intermediate results of `sample_affine`, for each of the N pixels of a patch.
 
     Attributes:
-        places: (N,) of the upper left one of 4 x 4 pixels in the image's memory.
+        places: (N,) index in the image's memory of the upper left one of 4 x 4 pixels.
         right_of: (N,) fraction of a pixel, along the rows, beyond the second of them.
         below: (N,) the same along the columns.
         words: (4, N) the rows of the 4 x 4 pixels.
@@ -84,14 +84,15 @@ def interpolated_row(row: Image, i: int, a0: np.float32, a1: np.float32, a2: np.
 
 
 class PixelWords(NamedTuple):
-    """An image as words of four pixels in a row, as many as the spline needs of it.
+    """An image as words of four pixels in a row, as many as the spline needs of a row.
 
-    One instruction fetches such words from sixteen places; fetched byte by byte, sampling took most of the time.
+    One instruction fetches such words from sixteen places; with pixels fetched one by one, sampling took most of the
+    time.
 
     Attributes:
-        words: (height * width - 3,) little-endian, each from the next pixel on; they overlap in the image's memory.
-        height: of the image.
-        width: of the image.
+        words: (height * width - 3,) little-endian, one beginning at each pixel; they overlap in the image's memory.
+        height: height of the image.
+        width: width of the image.
     """
 
     words: AnyArray

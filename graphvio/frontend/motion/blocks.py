@@ -1,4 +1,4 @@
-"""Points in blocks of 32, column by column, as vector instructions take them.
+"""Storage of points in blocks of 32, column by column, so that loops over them become vector instructions.
 
 A block is one flat array of rows of 32 numbers, one for each point, at constant offsets: a loop over the points of a
 block then compiles to instructions that work on eight points at once.
@@ -37,7 +37,7 @@ class Blocks(NamedTuple):
         pair: (B,) index of the pair.
         first: (B,) the block's first point among all; points follow each other.
         size: (B,) number of points; the lanes beyond repeat the last one and mean nothing.
-        values: (B, SIZE).
+        values: (B, SIZE) the blocks, with rows at the offsets `X` to `SEEN`.
     """
 
     pair: Int

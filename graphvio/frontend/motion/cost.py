@@ -10,8 +10,8 @@ from graphvio.kernels import fast_kernel, kernel, put, vector_kernel
 MIN_DEPTH_RATIO = 1e-3
 """Depth over the reference depth below which a point counts as behind the camera."""
 MAX_ERROR2 = 1e6
-"""Squared error over the squared scale of a point behind the camera, and the maximum of all others."""
-_BLOCK = 32  # (1 + 1e6)^32 is below the largest float; so it is for the points of `graphvio.frontend.motion.blocks`
+"""Squared error over the squared scale that a point behind the camera gets, and the upper limit for all others."""
+_BLOCK = 32  # (1 + 1e6)^32 is below the largest float; as many as the points of `graphvio.frontend.motion.blocks`
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """The upper three rows of a transform."""
@@ -90,9 +90,9 @@ def score_all(
 
 @kernel
 def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[Float, Float, Float, int]:
-    """Collect one pair's n points, and their left and right coordinates with weights, as columns in memory.
+    """Collect one pair's n points, and their left and right coordinates with weights, as contiguous rows of memory.
 
-    Each is (3, n), filled up to whole blocks with points of no weight.
+    Each array is (3, n), padded to whole blocks with points of zero weight.
     """
     n = 0
     for i in rows:
@@ -117,7 +117,7 @@ def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[
 
 @fast_kernel
 def _image_cost(motion: Float, points: Float, seen: Float, scale: float) -> float:
-    """Sum the robust cost in one image; one logarithm is taken of a block's product, which fits into a float."""
+    """Sum the robust cost in one image, with one logarithm for the product of a block's terms, which fits a float."""
     m, total = elements(motion), 0.0
     a, b, w = points[0], points[1], points[2]
     u, v, weight = seen[0], seen[1], seen[2]

@@ -1,8 +1,9 @@
-"""How a motion depends on depths by stereo that are wrong, as an error of a pair's calibration makes them.
+"""Derivatives of a motion with respect to errors of stereo depths, which errors of a pair's calibration cause.
 
-Principal points and the rotation from left to right add an offset to all inverse depths of a pair, at the reference and
-now alike; the baseline adds a share. By near points alone the two look like a translation, by far points alone an
-offset looks like a rotation: what becomes of the motion depends on where its points are.
+Errors of the principal points and of the rotation from left to right add an offset to all inverse depths of a pair, at
+the reference and now alike; an error of the baseline adds a share of them. For near points alone, both look like a
+translation; for far points alone, an offset looks like a rotation. The effect on the motion depends on where its points
+are.
 """
 
 from __future__ import annotations
@@ -16,33 +17,33 @@ from graphvio.geometry import se3_compose, se3_inverse
 from graphvio.kernels import kernel, put
 from graphvio.linear_algebra import solve_symmetric
 
-_WEAKEST_SIGMA = 1e3  # radians and metres over pixels, of directions that no point constrains
+_WEAKEST_SIGMA = 1e3  # radians and metres per pixel of noise, in directions that no point constrains
 
 
 @kernel
 def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cur_T_ref: Float) -> Float:
     """Return the derivatives of a motion with respect to errors of the pairs' depths.
 
-    They are those of the least squares solution on the inliers, where only depths at the reference are uncertain
-    besides the pixels now: within about a third of those of the refined motion.
+    They are those of the least-squares solution on the inliers, in which only the pixels now and the depths at the
+    reference are uncertain. They agree with those of the refined motion to about a third.
 
     Args:
-        rig: P pairs and single cameras.
+        rig: calibration of P pairs and single cameras.
         observations: N points of any subset of them.
         inlier: (N,) the points that the motion was refined on.
         cur_T_ref: (4, 4) the motion.
 
     Returns:
         (P, 2, 6) with respect to an offset of all inverse depths of a pair, 1/m, and to a share of them; tangent
-        ``[rotation, translation]`` of ``cur_T_ref`` in the body frame at the current instant, so the opposite of
-        what the pose there does. Zero for single cameras and pairs without points.
+        ``[rotation, translation]`` of ``cur_T_ref`` in the body frame at the current instant, so of opposite sign to
+        the change of the pose there. Zero for single cameras and pairs without points.
     """
     n_pairs, motions = len(rig.focal_px), camera_motions(cur_T_ref, rig)
     information, derivatives = np.eye(6) / _WEAKEST_SIGMA**2, np.zeros((n_pairs, 2, 6))
     baselines = np.empty((n_pairs, 4, 4))
     for j in range(n_pairs):
         put(baselines[j], se3_compose(rig.cam_T_body[j, 1], se3_inverse(rig.cam_T_body[j, 0])))
-    columns, by_depth = np.empty((4, 8)), np.empty(4)  # of four pixels, by motion, offset and share
+    columns, by_depth = np.empty((4, 8)), np.empty(4)  # rows: coordinates; columns: by motion, offset, share
     for i in range(len(inlier)):
         if not inlier[i]:
             continue
@@ -52,7 +53,7 @@ def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cu
             _add_image(rig, motions, j, 1, observations.points[i], columns, by_depth)
         length2 = 0.0
         for k in range(n):
-            shift = 0.0  # what the right image sees now is at a wrong depth, too
+            shift = 0.0  # of the right pixel now, by the same error of the depth
             if k >= 2:
                 shift = baselines[j, k - 2, 3] - observations.right[i, k - 2] * baselines[j, 2, 3]
                 shift *= rig.focal_px[j, 1]
@@ -83,19 +84,19 @@ def by_depth_errors(rig: RigArrays, observations: Observations, inlier: Bool, cu
 def _add_image(
     rig: RigArrays, motions: Float, j: int, side: int, point: Float, columns: Float, by_depth: Float
 ) -> float:
-    """Fill derivatives of a point's pixel in one image with respect to the motion and its inverse depth.
+    """Fill the derivatives of a point's pixel in one image with respect to the motion and the point's inverse depth.
 
     Args:
-        rig: P pairs and single cameras.
-        motions: (P, 2, 4, 4) of these, see `camera_motions`.
-        j: The pair.
-        side: Its image.
-        point: (3,) ``[x, y, 1/Z]`` at the reference, where the inverse depth is.
-        columns: (4, 8) output; the image's rows and the columns (6,) of the motion.
-        by_depth: (4,) output, likewise.
+        rig: calibration of P pairs and single cameras.
+        motions: (P, 2, 4, 4) motions of the cameras, see `camera_motions`.
+        j: Index of the pair.
+        side: Side of the image, 0 for left and 1 for right.
+        point: (3,) ``[x, y, 1/Z]`` at the reference; derivatives are with respect to the inverse depth there.
+        columns: (4, 8) output; the two rows of the image and the six columns of the motion are filled.
+        by_depth: (4,) output; the two elements of the image are filled.
 
     Returns:
-        Its inverse depth now.
+        The point's inverse depth now.
     """
     cam_T_body, motion, focal_px = rig.cam_T_body[j, side], motions[j, side], rig.focal_px[j, side]
     seen, in_body, by_place = np.empty(3), np.empty(3), np.empty(3)

@@ -1,12 +1,13 @@
-"""Common scale of a single camera's depths, which no motion that is measured by them shows.
+"""Common scale of a single camera's depths, which motions that are measured with these depths do not show.
 
-Depths from motion are as wrong as the length of the motions that they were computed from, all of a camera together.
-Taken for independent errors of its points, they would let yesterday's length of a step decide on today's: small biases
-of the tracks add up to a scale that pairs know better. So the scale of each single camera's depths is one more unknown.
+Depths from motion have the relative error of the motions that they were computed from, which is common to all points of
+a camera. Treated as independent errors of the points, it would let the length of an earlier motion determine that of
+the current one: small biases of the tracks would add up to an error of the scale, which pairs know better. So the scale
+of each single camera's depths is one more unknown.
 
-A factor ``1 + s`` of all inverse depths of a camera changes what it sees as a translation of the camera that is longer
-by that factor does: the derivative with respect to s is that with respect to the motion, along the direction d of the
-camera's translation.
+A factor ``1 + s`` of all inverse depths of a camera changes its image in the same way as a translation of the camera
+that is longer by that factor: the derivative with respect to s is that with respect to the motion, along the direction
+d of the camera's translation.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
 from graphvio.kernels import kernel
 from graphvio.measurements.motion import RelativeMotion
 
-_SIGMA = 0.01  # of a common scale, relative: wide next to what a good pair knows of a step, narrow next to the IMU
+_SIGMA = 0.01  # of a common scale, relative: large against a good pair's error of a step, small against the IMU's
 _WEAKEST_SIGMA = 10.0  # rad and m, of directions that no point constrains
-_DIRECTION_SHARE = 0.1  # of the error of a length, by which the direction is off: not all depths have one factor
+_DIRECTION_SHARE = 0.1  # of a length's error, added in all directions: not all depths have one factor
 
 
 def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Refined, config: MotionConfig) -> Refined:
-    """Add one unknown scale of the depths of each single camera to a refined motion: the corrected motion.
+    """Correct a refined motion and its covariance for one unknown scale of the depths of each single camera.
 
     Args:
-        rig: P pairs and single cameras.
+        rig: Calibration of P pairs and single cameras.
         observations: N points of any subset of them.
-        refined: The solution with all scales 1.
+        refined: The motion, estimated with all scales 1.
         config: Configuration of the motion stage.
     """
     singles = [j for j in observations.pairs if rig.is_single[j]]
@@ -60,7 +61,7 @@ def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Ref
         right_hand_side[k] = along @ gradient
     covariance = np.linalg.inv(information)
     known = np.linalg.inv(information[:6, :6])
-    noise = float(np.trace(refined.covariance @ information[:6, :6])) / 6.0  # over the modelled one
+    noise = float(np.trace(refined.covariance @ information[:6, :6])) / 6.0  # variance over the modelled one
     gained = noise * (covariance[:6, :6] - known)
     step = covariance[:6] @ right_hand_side
     return replace(
@@ -72,23 +73,23 @@ def with_unknown_scales(rig: RigArrays, observations: Observations, refined: Ref
 
 
 def is_of_singles(rig: RigArrays, observations: Observations, refined: Refined) -> bool:
-    """Return whether a motion explains points of single cameras only, so that its length is that of their depths."""
+    """Return whether a motion explains points of single cameras only, so that its length comes from their depths."""
     return bool(rig.is_single[observations.pair[refined.inlier]].all())
 
 
 def with_free_length(
     rig: RigArrays, observations: Observations, refined: Refined, motion: RelativeMotion, predicted: Float | None
 ) -> RelativeMotion:
-    """Let the length of a motion be unknown that single cameras alone have measured; another one stays as it is.
+    """Make the length of a motion unknown if single cameras alone have measured it; other motions stay as they are.
 
-    The depths are those of motions that the same cameras measured alone: an error of the scale would go on in them.
+    The depths come from motions that the same cameras measured alone, so that an error of the scale would persist.
 
     Args:
-        rig: P pairs and single cameras.
+        rig: Calibration of P pairs and single cameras.
         observations: N points.
-        refined: The solution for them.
-        motion: The same, with its covariance.
-        predicted: ``cur_T_ref`` (4, 4) of body by the state, or None where it is not known.
+        refined: The motion estimated from them.
+        motion: The same as a measurement, with its covariance.
+        predicted: ``cur_T_ref`` (4, 4) of body as the state predicts it, or None where it is not known.
     """
     if not is_of_singles(rig, observations, refined):
         return motion
@@ -109,16 +110,17 @@ def with_free_length(
 def _with_possible_length(
     rig: RigArrays, single: int, motion: RelativeMotion, predicted: Float, slack_m: float
 ) -> RelativeMotion:
-    """Return a motion of single cameras with a length that the rig can have: while no depth is known, any fits.
+    """Limit the length of a motion by single cameras to what is possible: while no depth is known, any length fits.
 
-    Soon after a standstill, depths are anything: the motion may be several times too long, and bends with them.
+    Soon after a standstill, depths may be far off: the motion may be several times too long, and its direction is off
+    with them.
 
     Args:
-        rig: P pairs and single cameras.
-        single: The camera, or one of several.
-        motion: With any length.
-        predicted: ``cur_T_ref`` (4, 4) of body.
-        slack_m: By how much a translation may be longer than the predicted one.
+        rig: Calibration of P pairs and single cameras.
+        single: Index of the camera, or of one of several.
+        motion: The motion, of any length.
+        predicted: ``cur_T_ref`` (4, 4) of body as the state predicts it.
+        slack_m: By how much the translation may be longer than the predicted one.
     """
     body_T_cam = np.ascontiguousarray(rig.body_T_left[single])
     cam_T_body = se3_inverse(body_T_cam)
@@ -142,7 +144,7 @@ def _with_possible_length(
 
 
 def with_scale_of_depths(rig: RigArrays, single: int, motion: Refined) -> Refined:
-    """Enlarge the covariance of a single camera's own motion by what is not known of its depths' scale."""
+    """Enlarge the covariance of a single camera's own motion by the uncertainty of its depths' scale."""
     along = _SIGMA * _along_translation(rig, single, motion.cur_T_ref)
     scale_covariance = np.outer(along, along)
     return replace(

@@ -1,13 +1,13 @@
-"""What few points show of a motion: too little to measure it, but enough to correct how it is predicted.
+"""Correction of a predicted motion by few points: too few to measure a motion, but enough to improve the prediction.
 
-Before a blank wall, a handful of points may be in view. They constrain the motion in some directions only, or with so
-little redundancy that wrong points do not stand out. But an IMU predicts the motion since the last frameset to a
-fraction of a pixel. Wrong points then do stand out, and the errors of the others are linear in the error of the
-prediction: their normal equations are information about the motion, and the state estimator weighs it against the
-IMU's. It is what these points would contribute as landmarks of a tightly coupled estimator.
+Before a blank wall, only a handful of points may be in view. They constrain the motion in some directions only, or with
+so little redundancy that wrong points do not stand out. But an IMU predicts the motion since the last frameset to a
+fraction of a pixel. Against this prediction wrong points do stand out, and the errors of the others are linear in its
+error: their normal equations are information about the motion, which the state estimator weighs against the IMU's. It
+is the information that these points would contribute as landmarks of a tightly coupled estimator.
 
-This is the linearisation of `graphvio.frontend.motion.linearisation` in plain numpy, for the few framesets that need
-it: a kernel is compiled again for each caller, and would make the first such frameset, or every start, wait.
+The linearisation is that of `graphvio.frontend.motion.linearisation`, in plain numpy, for the few framesets that need
+it: a kernel is compiled again for each caller, which would delay the first such frameset, or every start.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from graphvio.frontend.motion.observations import Observations, RigArrays
 from graphvio.frontend.motion.refinement import SHARED_BOUNDS
 from graphvio.geometry import se3_exp
 
-_PREDICTION_SIGMAS = np.repeat([0.05, 0.2], 3)  # rad, m: far more than a prediction by an IMU may be off
-_NEXT_TO_NOTHING = 1e-4  # of the prior's information
+_PREDICTION_SIGMAS = np.repeat([0.05, 0.2], 3)  # rad, m: far larger than errors of a prediction by an IMU
+_NEXT_TO_NOTHING = 1e-4  # of the prior's information, which keeps the covariance finite
 _ROUNDS = 4
 _MIN_POINTS = 3  # fewer could not contradict each other
 _CUTOFF2 = 25.0  # squared whitened error of a point, which one right point in 20,000 exceeds
@@ -31,12 +31,12 @@ _PRIOR_RESIDUALS = 3.0  # weight of the expected noise, where so few residuals s
 
 
 class FewPoints(NamedTuple):
-    """A motion as it is predicted, corrected in the directions that few points show.
+    """A predicted motion, corrected in the directions that few points constrain.
 
     Attributes:
-        cur_T_ref: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant: of what the
-            points show, without the prediction, so that it is very large where they show nothing.
+        cur_T_ref: (4, 4) motion of body.
+        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant: by the points
+            alone, without the prediction, so that it is very large in directions that they do not constrain.
         shared_covariance: (6, 6) the part of it that all motions from the same reference have in common, since they
             depend on the same triangulated points.
         inlier: (N,) the points that agree with it.
@@ -51,12 +51,12 @@ class FewPoints(NamedTuple):
 def fit_few_points(
     rig: RigArrays, observations: Observations, predicted: Float, sigma_px: float, max_error_px: float
 ) -> FewPoints | None:
-    """Correct a predicted motion by few points, by least squares without those that do not fit.
+    """Correct a predicted motion by least squares on few points, leaving out those that do not fit.
 
     Args:
-        rig: of P pairs.
+        rig: calibration of P pairs.
         observations: N points of any subset of them.
-        predicted: ``cur_T_ref`` (4, 4), to about ``max_error_px``.
+        predicted: predicted ``cur_T_ref`` (4, 4), accurate to about ``max_error_px`` in the images.
         sigma_px: expected noise of a pixel; residuals may show that there is more.
         max_error_px: largest error of a point under the predicted motion.
 
@@ -77,7 +77,7 @@ def fit_few_points(
     errors_left = _squared(errors - by_motion @ correction)[inlier].sum()
     redundancy = max(np.where(observations.has_right[inlier], 4.0, 2.0).sum() - 6.0, 0.0)
     variance = max((errors_left + _PRIOR_RESIDUALS) / (redundancy + _PRIOR_RESIDUALS), 1.0)
-    # The prior only bounds the correction: what it says is known from the IMU, and not to be counted twice.
+    # The prior only bounds the correction: its information is the IMU's, and must not be counted twice.
     covariance = np.linalg.inv(information / variance + _NEXT_TO_NOTHING * prior)
     of_score = through_points[inlier].sum(axis=0) / variance
     shared = _bounded(covariance @ of_score @ covariance, covariance)
@@ -106,11 +106,12 @@ def _whitened(
     an image that does not see the point are zero.
 
     Returns:
-        Errors (N, 4) in both images; derivatives (N, 4, 6) by ``exp(d) cur_T_ref``; variance (N, 6, 6) of the score
-        by the error of the point itself, ``J^T S^-1 J - sigma^2 J^T S^-2 J``; and which points (N,) are in front.
+        Errors (N, 4) in both images; derivatives (N, 4, 6) with respect to d in ``exp(d) cur_T_ref``; the variance
+        (N, 6, 6) of the score that is due to the error of the point itself, ``J^T S^-1 J - sigma^2 J^T S^-2 J``; and
+        which points (N,) are in front of the cameras.
     """
     pair, (x, y, w), n = observations.pair, observations.points.T, len(observations.pair)
-    at_reference = np.column_stack([x, y, np.ones(n), w])  # homogeneous, over the depth there
+    at_reference = np.column_stack([x, y, np.ones(n), w])  # homogeneous, divided by the depth there
     in_body = np.einsum("nij,nj->ni", cur_T_ref @ rig.body_T_left[pair], at_reference)
     to_camera = camera_motions(np.ascontiguousarray(cur_T_ref), rig)[pair]
     errors, by_motion, by_point = np.zeros((n, 4)), np.zeros((n, 4, 6)), np.zeros((n, 4, 3))

@@ -1,10 +1,11 @@
 """Whitened reprojection errors of many points, and their normal equations for a step of the motion (sections 3 and 5).
 
 A point's error in both images is one vector of four. Its covariance is that of its pair's pixels plus that of the
-triangulated point as it is seen from here, ``S = sigma^2 (1 + J_X C_X J_X^T)``: near points, whose depth is known
-well, count for more. Points are errors in variables: derivatives are taken at the place that both instants together
-give a point, not at the triangulated one, whose noise is in the residual too and would bias the motion (maximum
-likelihood with the points eliminated; R. Hartley, A. Zisserman, *Multiple View Geometry*, 2004, section 5.2).
+triangulated point, projected into the current images, ``S = sigma^2 (1 + J_X C_X J_X^T)``: near points, whose depth is
+known well, count for more. Points are treated as errors in variables: derivatives are taken at the position that both
+instants together give a point, not at the triangulated one, whose noise is in the residual too and would bias the
+motion (maximum likelihood with the points eliminated; R. Hartley, A. Zisserman, *Multiple View Geometry*, 2004,
+section 5.2).
 """
 
 from typing import NamedTuple
@@ -34,7 +35,7 @@ _RELINEARISATIONS = 2
 _MAX_FOLLOWED_ERROR2 = (
     16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage
 )
-_COLUMN = 4 * POINTS  # of whitened derivatives: the four rows of each of a block's points
+_COLUMN = 4 * POINTS  # size of a column of whitened derivatives: the four rows of each of a block's points
 
 
 class LinearisationPoints(NamedTuple):
@@ -42,8 +43,8 @@ class LinearisationPoints(NamedTuple):
 
     Attributes:
         shifts: (B, 3 POINTS) corrections of the points, by the errors at both instants.
-        points: (B, 3 POINTS) corrected, by the shifts of before.
-        offsets: (B, 4 POINTS) effect of that correction, pixels.
+        points: (B, 3 POINTS) points corrected by the shifts of the iteration before.
+        offsets: (B, 4 POINTS) effect of that correction on the errors, pixels.
         whiteners: (B, 10 POINTS) inverse Cholesky factors of the covariances S, lower triangles row by row.
     """
 
@@ -68,14 +69,14 @@ def relinearise_points(
 ) -> None:
     """Re-estimate each point from both instants (errors in variables), and compute its whitener ``S^-1/2``.
 
-    The search for the points' places continues from those of the last call.
+    The iteration of the points' positions continues from those of the last call.
 
     Args:
         motions: (P, 2, 4, 4), see `graphvio.frontend.motion.cost.camera_motions`.
-        rig: of P pairs.
-        blocks: of N points.
+        rig: calibration of P pairs.
+        blocks: blocks of N points.
         sigmas_px: (P,) pixel noise of each pair.
-        points_at: output.
+        points_at: linearisation points, updated in place.
     """
     for b in range(len(blocks.pair)):
         j = blocks.pair[b]
@@ -115,7 +116,7 @@ def _relinearise_block(
         wa, wb, wd, we = whiten(lower, (ra - oa, rb - ob, rd - od, re - oe))
         e2 = wa * wa + wb * wb + wd * wd + we * we
         share = sigma * sigma * min(1.0, _MAX_FOLLOWED_ERROR2 / max(e2, 1e-12))
-        # C J^T S^-1 r: where the residual r would have the point
+        # C J^T S^-1 r: the shift of the point by which the residual r is explained best
         ba, bb, bd, be = whiten_transposed(lower, (share * wa, share * wb, share * wd, share * we))
         put3(shifts, i, (
             ca[0] * ba + cb[0] * bb + cd[0] * bd + ce[0] * be,
@@ -136,11 +137,11 @@ def linearise(
 
     Args:
         motions: (P, 2, 4, 4) at which to linearise.
-        rig: of P pairs.
-        blocks: of N points.
-        points_at: of the points, see `relinearise_points`.
-        active: (B, POINTS) 1 for points that count; the others, which are 0, only get their errors.
-        scale: of the Cauchy cost, in whitened units.
+        rig: calibration of P pairs.
+        blocks: blocks of N points.
+        points_at: linearisation points, see `relinearise_points`.
+        active: (B, POINTS) 1 for points that count; for the others, which are 0, only the errors are computed.
+        scale: scale of the Cauchy cost, in whitened units.
         hessian: (6, 6) output.
         gradient: (6,) output.
         errors2: (B, POINTS) output, squared whitened errors, infinite behind a camera.
@@ -185,7 +186,7 @@ def _whiten_block(
     motions: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, b: int, columns: Float,
     errors2: Float,
 ) -> None:  # fmt: skip
-    """Fill a block's whitened derivatives (6, 4, POINTS), after them its errors (4, POINTS), and their squares."""
+    """Fill a block's whitened derivatives (6, 4, POINTS), then its errors (4, POINTS), and their squares (POINTS,)."""
     j, block, points, offsets, whiteners = (
         blocks.pair[b], blocks.values[b], points_at.points[b], points_at.offsets[b], points_at.whiteners[b],
     )  # fmt: skip
@@ -200,7 +201,7 @@ def _whiten_block(
         right_u, right_v, in_front_of_right = derivatives_by_motion(
             to_right, right_T_body, focal_right, point, block[RIGHT_U + i], block[RIGHT_V + i]
         )
-        # The right image's rows are computed always, and zero where it does not see the point: no branches.
+        # The right image's rows are always computed, and zeroed where it does not see the point, without branches.
         seen = block[SEEN + i]
         lower = whitener_of(whiteners, i, seen)
         for c in range(6):

@@ -12,22 +12,22 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.kernels import kernel
 
 _PRIOR_RESIDUALS = 3.0  # weight of the modelled noise, for where there are few points
-_EXCESS_INFORMATION = 1.04  # of normal matrices at noisy points, by Monte Carlo
+_EXCESS_INFORMATION = 1.04  # factor by which normal matrices at noisy points are too large, by Monte Carlo
 _CUTOFF = 25.0  # squared error over the noise variance: exceeded by one right point in 20,000 (4 degrees of freedom)
 _MEDIAN_CHI2_OF_2, _MEDIAN_CHI2_OF_4 = 1.386, 3.357
 _MIN_VARIANCE = 0.05
 _POINTS_OF_EQUAL_NOISE = 10.0  # weight of the prior that a pair's noise is that of the others
-_MAX_RATIO = 4.0  # variance over that of all; a larger one is another motion, not noise
+_MAX_RATIO = 4.0  # variance over that of all pairs; a larger one is due to another motion, not to noise
 
 
 class Influence(NamedTuple):
     """Moments of the residuals.
 
     Attributes:
-        factor: for the inverse of the weighted normal matrix, which gives the covariance.
+        factor: factor on the inverse of the weighted normal matrix, which makes it the covariance.
         weight: mean of ``w``.
         slope: mean of ``psi'``.
-        variance: of the noise, over the modelled one.
+        variance: variance of the noise, over the modelled one.
     """
 
     factor: float
@@ -50,7 +50,7 @@ def influence(errors2: Float, has_right: Bool, scale: float) -> Influence:
     if n == 0.0:
         return Influence(1.0, 1.0, 1.0, 1.0)
     weight, slope = weights / n, slopes / n
-    # The mean of 1 / chi^2 lacks two degrees of freedom: without them the variance is right on average.
+    # The mean of 1 / chi^2 of n degrees of freedom is 1 / (n - 2): over n - 2, the inverse variance is unbiased.
     variance = (squares / slope**2 + _PRIOR_RESIDUALS) / (max(n - 6.0, 0.0) + _PRIOR_RESIDUALS - 2.0)
     variance *= _EXCESS_INFORMATION
     return Influence(weight * variance, weight, slope, variance)

@@ -1,4 +1,4 @@
-"""Correspondences between two framesets, from which their relative motion is estimated, of all pairs in one.
+"""Correspondences of all pairs between two framesets, from which the relative motion is estimated.
 
 All pairs are expressed in one frame, body: a motion hypothesis is ``cur_T_ref``, which maps points of the rig's body
 frame from the reference instant to the current one. Pair j's own motion, the paper's ``P_j``, is
@@ -22,14 +22,15 @@ _MAX_RELATIVE_DEPTH_SIGMA = 0.1
 
 
 class RigArrays(NamedTuple):
-    """Calibration of a rig of P groups of cameras, as kernels take it; side 0 is left, 1 right.
+    """Calibration of a rig of P groups of cameras, as arrays for kernels; side 0 is left, 1 right.
 
-    A single camera is a pair whose right camera, which never sees a point, is the left one again.
+    A single camera is stored as a pair whose right camera, which never sees a point, is the left one again.
 
     Attributes:
-        cam_T_body: (P, 2, 4, 4).
-        body_T_left: (P, 4, 4) of the left camera that saw the points at the reference, of another pair in `crossed`.
-        focal_px: (P, 2), pixels per normalised image unit.
+        cam_T_body: (P, 2, 4, 4) transforms from body to each camera.
+        body_T_left: (P, 4, 4) pose in body of the left camera that saw the points at the reference; in a rig made by
+            `crossed`, this is the camera of another pair.
+        focal_px: (P, 2) focal lengths, pixels per normalised image unit.
     """
 
     cam_T_body: Float
@@ -52,9 +53,10 @@ class RigArrays(NamedTuple):
         return np.asarray((self.cam_T_body[:, 0] == self.cam_T_body[:, 1]).all(axis=(1, 2)))
 
     def crossed(self, pairs: Sequence[tuple[int, int]]) -> RigArrays:
-        """Build a virtual rig with a pair for each of K pairs (a, b).
+        """Build a virtual rig with one pair for each of K tuples (a, b) of pair indices.
 
-        Its pair k has its points at the reference in the left camera of pair a, and sees them by the cameras of pair b.
+        The points of its pair k are given in the left camera of pair a at the reference, and are seen now by the
+        cameras of pair b.
         """
         of, by = [a for a, _ in pairs], [b for _, b in pairs]
         return RigArrays(self.cam_T_body[by], self.body_T_left[of], self.focal_px[by])
@@ -76,7 +78,7 @@ class Observations(NamedTuple):
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
         left: (N, 2) normalised coordinates in the current left image.
         right: (N, 2) the same in the current right image; zero where it is not ``has_right``.
-        has_right: (N,).
+        has_right: (N,) whether the current right image sees the point.
     """
 
     pair: Int
@@ -92,7 +94,7 @@ class Observations(NamedTuple):
         return tuple(int(j) for j in np.flatnonzero(np.bincount(self.pair)))
 
     def has_known_depth(self, sigma_px: float) -> Bool:
-        """Select the points (N,) whose depth is known to a tenth, for a pixel noise."""
+        """Select the points (N,) whose inverse depth is known to a tenth, for a pixel noise in pixels."""
         return np.asarray(sigma_px * np.sqrt(self.covariances[:, 2, 2]) < _MAX_RELATIVE_DEPTH_SIGMA * self.points[:, 2])
 
     def of_pair(self, pair: int) -> Observations:
@@ -108,7 +110,7 @@ class Observations(NamedTuple):
 
 
 def is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) -> Bool:
-    """Select the points (N,) on which a motion can be judged: not those of single cameras whose depth is unknown."""
+    """Select the points (N,) that a motion can be tested on: not those of single cameras with hardly known depth."""
     is_single = rig.is_single
     if not is_single.any():
         return np.ones(len(observations.pair), dtype=bool)
@@ -118,18 +120,16 @@ def is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) 
 def image_by_image(rig: RigArrays, observations: Observations) -> tuple[RigArrays, Observations, Int]:
     """Split observations into those of single images, with exact points, as eq. (2) has them.
 
-    Each image becomes a pair of its own without a right camera, and the points' covariances zero.
-
-    What kernels compute of one point is then the error of one image as a vector of two, with the plain noise of its
-    pixels, as in eq. (2).
+    Each image becomes a pair of its own without a right camera, and the points' covariances become zero. The error that
+    kernels compute for a point is then a vector of two, in one image, with only the noise of its pixels, as in eq. (2).
 
     Args:
-        rig: of P pairs.
+        rig: calibration of P pairs.
         observations: N points of any subset of them.
 
     Returns:
-        The rig as 2P pairs, each pair's left camera before its right one; the M observations in one image; and the row
-        (M,) of the given observations that each is of.
+        The rig as 2P pairs, each pair's left camera before its right one; the M observations in single images; and for
+        each of them its row (M,) in the given observations.
     """
     images = RigArrays(
         np.repeat(rig.cam_T_body.reshape(-1, 1, 4, 4), 2, axis=1),
@@ -152,10 +152,10 @@ class Correspondences:
     """Observations, and the tracks that they came from.
 
     Attributes:
-        observations: of all pairs.
+        observations: the points of all pairs.
         rows: pair -> (M,) rows of the current `TrackedFrame` that take part, in order.
-        candidates: pair -> number of points that its reference had, of the pairs that take part.
-        singles: which of them are single cameras.
+        candidates: pair -> number of points with depth at its reference, for the pairs that take part.
+        singles: which of these pairs are single cameras.
     """
 
     observations: Observations

@@ -1,6 +1,6 @@
 """The paper's visual odometry (sections 2, 3 and 3.1), equation by equation, in plain numpy.
 
-These functions are to be read beside the paper, and tests hold the odometry's kernels against them. The kernels compute
+These functions are to be read beside the paper, and tests compare the odometry's kernels with them. The kernels compute
 the same faster, with the motions of all pairs expressed as one motion ``cur_T_ref`` of the body frame: eq. (1) to (3)
 are in `graphvio.frontend.motion.cost`, eq. (4) in `graphvio.frontend.motion.selection`, the hypotheses in
 `graphvio.frontend.motion.ransac` and the minimisation in `graphvio.frontend.motion.refinement`, which says where it
@@ -89,7 +89,7 @@ def cost(P: Float, points: PairPoints, a_px: float) -> float:
 
     Args:
         P: (4, 4) ``left_next_T_left_prev`` of the pair.
-        points: of the pair.
+        points: points of the pair.
         a_px: scale ``a`` of the robust cost, pixels.
     """
     in_left = points.X @ P.T
@@ -117,9 +117,9 @@ def global_cost(P: Float, pair: int, points: Sequence[PairPoints], body_T_left: 
 
     Args:
         P: (4, 4) ``left_next_T_left_prev`` of the pair.
-        pair: its index j.
-        points: of each pair.
-        body_T_left: (J, 4, 4) of each pair's left camera; ``P_ij`` is ``left_i_T_body body_T_left_j``.
+        pair: index j of the pair.
+        points: points of each pair.
+        body_T_left: (J, 4, 4) poses of the pairs' left cameras; ``P_ij`` is ``left_i_T_body body_T_left_j``.
         a_px: scale ``a`` of the robust cost, pixels.
     """
     total = 0.0
@@ -134,8 +134,8 @@ def best_pair(motions: Sequence[Float], points: Sequence[PairPoints], body_T_lef
 
     Args:
         motions: (4, 4) ``left_next_T_left_prev`` of each pair.
-        points: of each pair.
-        body_T_left: (J, 4, 4) of each pair's left camera.
+        points: points of each pair.
+        body_T_left: (J, 4, 4) poses of the pairs' left cameras.
         a_px: scale ``a`` of the robust cost, pixels.
     """
     return int(np.argmin([global_cost(P, j, points, body_T_left, a_px) for j, P in enumerate(motions)]))

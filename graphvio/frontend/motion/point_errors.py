@@ -101,7 +101,8 @@ def inverse_cholesky(
 ) -> Lower:  # fmt: skip
     """Invert the lower Cholesky factor of ``1 + A``, A positive semidefinite (4, 4), and multiply it by a factor.
 
-    Its pivots are at least 1; rounding takes them below where a point is next to the plane of the camera.
+    The pivots are at least 1, and are bounded to that: for a point next to the camera's plane, rounding may take them
+    below.
     """
     d0 = 1.0 / np.sqrt(s00)
     c10, c20, c30 = s10 * d0, s20 * d0, s30 * d0

@@ -1,4 +1,4 @@
-"""How far a measured motion can be trusted."""
+"""Quality of a measured motion: checks that enlarge its covariance and grade it as good or weak."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _T = THRESHOLDS.quality
 
 
 class StereoShare(NamedTuple):
-    """Share of the corners that the right images confirm.
+    """Share of the corners that are found in the right images, too.
 
     Attributes:
-        share: Of all corners, those found in the right image: the smaller one of reference and newest frame.
+        share: Share of all corners; of each pair, the smaller one of reference and newest frame counts.
         baseline_m: Longest baseline of the pairs in view.
     """
 
@@ -32,7 +32,7 @@ class StereoShare(NamedTuple):
 def stereo_share(
     reference: Mapping[int, TrackedFrame], current: Mapping[int, TrackedFrame], baselines_m: Sequence[float]
 ) -> StereoShare:
-    """Return the share for a frameset, in which a pair counts by its corners even if the motion explains none."""
+    """Return the share for a frameset; pairs are weighted by their corners, even if the motion explains none."""
     pairs = sorted(reference.keys() & current.keys())
     corners = [len(current[j].ids) for j in pairs]
     shares = [min(_share(reference[j].has_depth), _share(current[j].has_depth)) for j in pairs]
@@ -48,8 +48,8 @@ class CheckedHypothesis(NamedTuple):
     """A motion hypothesis after its own checks.
 
     Attributes:
-        motion: With a covariance that allows for what speaks against it.
-        reasons: What that is, in words.
+        motion: The motion, with a covariance that failed checks have enlarged.
+        reasons: The failed checks, in words.
     """
 
     motion: RelativeMotion
@@ -59,18 +59,18 @@ class CheckedHypothesis(NamedTuple):
 def checked_hypothesis(
     motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoShare, noise: float
 ) -> CheckedHypothesis:
-    """Enlarge the covariance for few points, blur, repeated images, and right images that do not confirm the left.
+    """Enlarge the covariance for few points, blur, repeated images, and right images that do not match the left ones.
 
     Args:
         motion: Motion of one hypothesis, see `graphvio.frontend.pairs.agreement`.
         frozen_since_ns: Stamp since which all images are the same, or None.
-        stereo: How far the right images confirm what the left ones see.
+        stereo: Share of the corners that are found in the right images.
         noise: Root mean square error of the points that the motion explains, over that of the modelled noise.
     """
     covariance, reasons = motion.covariance, []
     if noise > 1.0:
-        # The residuals' mean square is in the covariance already. But motions from images that are blurred are worse
-        # than that: the mean of their squared errors over it becomes a few times larger.
+        # The residuals' mean square is in the covariance already. But motions from blurred images are worse than that:
+        # their squared errors, over the covariance, become a few times larger on average.
         covariance = covariance * noise**2
         if noise > _T.max_blur:
             reasons.append(f"points fit {noise:.1f} times worse than those of sharp images")
@@ -79,7 +79,7 @@ def checked_hypothesis(
         covariance = covariance + np.diag((2.0 * lacking * _T.possible_speeds * motion.duration_s) ** 2)
         reasons.append(f"only {motion.inliers} points")
     if stereo.share < _T.min_stereo_share:
-        # Cables that are swapped move a view by the baseline; what little is matched then may repeat by chance.
+        # Swapped cables move a view by the baseline; the few corners that are then matched may be so by chance.
         sigmas = _T.possible_speeds * motion.duration_s + np.repeat([0.0, stereo.baseline_m], 3)
         covariance = covariance + np.diag(sigmas**2)
         reasons.append(f"only {100 * stereo.share:.0f} % of the corners are found in the right images")
@@ -93,7 +93,7 @@ def checked_hypothesis(
 def motion_with_quality(
     hypotheses: Sequence[CheckedHypothesis], max_distance: float, *, has_length: bool = True
 ) -> tuple[RelativeMotion, Quality, str]:
-    """Return the first hypothesis' motion, with a covariance that covers the others, its quality, and why.
+    """Return the first hypothesis' motion, with a covariance that covers the others; its quality; and the reasons.
 
     Args:
         hypotheses: In the order of `graphvio.frontend.pairs.agreement.Agreement`.
@@ -106,7 +106,7 @@ def motion_with_quality(
         if rival.inliers >= _T.min_rival_share * best.inliers:
             apart = se3_log(se3_inverse(best.reference_T_current) @ rival.reference_T_current)
             angle, distance = np.linalg.norm(apart[:3]), np.linalg.norm(apart[3:])
-            # In all directions: what fills one view may fill part of the other, and then neither is right.
+            # In all directions: an object that fills one view may fill part of another, and then neither is right.
             covariance = covariance + rival.covariance + np.diag(np.repeat([angle, distance], 3) ** 2)
             reasons.append(f"two motions are seen, {distance:.3f} m and {np.rad2deg(angle):.2f} deg apart")
     motion = replace(best, covariance=covariance)

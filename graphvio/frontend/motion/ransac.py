@@ -18,12 +18,12 @@ _FIRST_BATCH = 6
 def search(
     rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> Float:
-    """Find the best motion ``cur_T_ref`` (4, 4): hypotheses of every pair, scored on every pair (section 3.1).
+    """Find the best motion ``cur_T_ref`` (4, 4) among hypotheses of every pair, scored on every pair (section 3.1).
 
-    Hypotheses are sampled in batches, until one of them is of three right points with probability
-    ``config.confidence``, going by the share of points that the best one explains (M. Fischler, R. Bolles, *Random
-    sample consensus*, CACM 24(6), 1981). ``config.hypotheses`` of each pair is the maximum; confidence 1 samples them
-    all at once.
+    Hypotheses are sampled in batches until, with probability ``config.confidence``, one of them comes from three
+    inliers, given the share of points that the best one explains (M. Fischler, R. Bolles, *Random sample consensus*,
+    CACM 24(6), 1981). At most ``config.hypotheses`` triples are sampled of each pair; with confidence 1, all of them at
+    once.
 
     For arguments see `graphvio.frontend.motion.selection.searched_and_refined`.
     """
@@ -41,7 +41,7 @@ def search(
         ]
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.log1p(-min(config.confidence, 1.0 - 1e-12)) / np.log1p(-(shares**3))
-        # A right triple of one pair is enough: an obstructed pair may have none.
+        # A triple of inliers of one pair is enough: an obstructed pair may have none.
         if sampled >= np.min(np.where(shares < 1.0, needed, 0.0), initial=config.hypotheses):
             break
     return best
@@ -53,8 +53,8 @@ def hypothesise(
     """Generate motion hypotheses by 3-point resection of random triples.
 
     Args:
-        rig: of P pairs.
-        observations: of any subset of them.
+        rig: calibration of P pairs.
+        observations: points of any subset of them.
         count: number of triples of each pair; some have no solution.
         pixel_sigma_px: standard deviation of a corner's position, by which points of unknown depth are left out.
         rng: source of the random triples.
@@ -80,9 +80,9 @@ def preempt(
     are used up, the best score wins.
 
     Args:
-        rig: of P pairs.
-        observations: of any subset of them.
-        hypotheses: (H, 4, 4).
+        rig: calibration of P pairs.
+        observations: points of any subset of them.
+        hypotheses: (H, 4, 4) motions ``cur_T_ref``.
         chunk_points: number of points of each pair in a chunk.
         cauchy_scale_px: scale ``a`` of the robust cost.
         rng: source of the points' order.
@@ -115,7 +115,7 @@ def _preempt(
 
 @kernel
 def _places_in_pair(pair: Int, pairs: int) -> Int:
-    """Count how many of the same pair come before each (N,)."""
+    """Count, for each point (N,), how many points of the same pair come before it."""
     before, places = np.zeros(pairs, dtype=np.int64), np.empty(len(pair), dtype=np.int64)
     for i in range(len(pair)):
         places[i] = before[pair[i]]
@@ -174,7 +174,7 @@ def _resect_triples(
 
 @kernel
 def _resect_triple(triple: Int, observations: Observations, right_T_left: Float, focal_px: float) -> tuple[Float, bool]:
-    """Find the pose (4, 4) of three points that fits the right image best; False if there is none."""
+    """Find the motion (4, 4) of the left camera by three points that fits the right image best; False if none."""
     corners, rays = np.empty((3, 3)), np.empty((3, 3))
     points, left, right = observations.points, observations.left, observations.right
     for k in range(3):

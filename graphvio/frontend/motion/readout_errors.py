@@ -1,4 +1,4 @@
-"""How errors of the velocity, by which rolling shutters are compensated, change a motion."""
+"""Derivatives of a motion with respect to the velocities by which rolling shutters are compensated."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from graphvio.geometry import se3_adjoint
 from graphvio.kernels import kernel
 from graphvio.linear_algebra import solve_rows
 
-_SCALE = 10.0  # of the cost, in standard deviations: inliers count alike
+_SCALE = 10.0  # of the cost, in standard deviations: inliers get nearly equal weights
 _PRIOR = 1e-2  # information of a motion's rotation and translation, so that some directions may be unknown
 
 
@@ -20,20 +20,21 @@ def derivatives_by_velocities(
 ) -> Float:
     """Return the derivatives of a motion with respect to the velocities now and at the reference.
 
-    A line that is exposed some time after the stamp sees points from where the camera is then: an error of the velocity
-    moves its points by that time, as a motion would. In a narrow view, rows at the top and at the bottom then look like
-    those of a camera that turns, and the error of the motion is larger than the way within the readout.
+    A line that is exposed some time after the stamp sees points from the camera's position at that time. An error of
+    the velocity, multiplied by that time, shifts the line's points as a translation would. In a narrow view, different
+    shifts at the top and at the bottom look like a rotation of the camera, and the error of the motion is larger than
+    that of the displacement within the readout.
 
     Args:
-        rig: of P pairs.
+        rig: calibration of P pairs.
         observations: N points of any subset of them.
-        inlier: (N,) those that the motion is of.
+        inlier: (N,) the points that the motion explains.
         cur_T_ref: (4, 4) motion of body.
-        sigma_px: noise of a pixel.
+        sigma_px: standard deviation of the pixel noise.
         seconds: (2, N) from the stamp until a point's line was exposed, now and at the reference.
 
     Returns:
-        (2, 6, 3) see `graphvio.measurements.motion.ByVelocities`.
+        (2, 6, 3) derivatives, see `graphvio.measurements.motion.ByVelocities`.
     """
     motion = np.ascontiguousarray(cur_T_ref)
     information, now, then = _moments(rig, observations, inlier.astype(np.float64), motion, sigma_px, seconds)
@@ -45,7 +46,7 @@ def derivatives_by_velocities(
 def _moments(
     rig: RigArrays, observations: Observations, counted: Float, cur_T_ref: Float, sigma_px: float, seconds: Float
 ) -> tuple[Float, Float, Float]:
-    """Return normal matrices (6, 6) of a motion: of its points, and of these weighted with each of two times."""
+    """Return three normal matrices (6, 6) of a motion: of its points, and of these weighted with either time."""
     blocks, motions = in_blocks(observations), camera_motions(cur_T_ref, rig)
     points_at, sigmas_px = allocate_points(blocks), np.full(len(rig.focal_px), sigma_px)
     relinearise_points(motions, rig, blocks, sigmas_px, points_at)

@@ -1,8 +1,8 @@
 """Refinement of a motion on the points of all pairs, and its covariance (sections 3, 3.1 and 5).
 
 Levenberg-Marquardt minimises the Cauchy cost of the whitened errors of `graphvio.frontend.motion.linearisation`; points
-that turn out to be no inliers are then left out, since the Cauchy weight of many that err alike never vanishes. The
-scale of the cost is that of the configuration for the modelled noise, and less where the residuals are smaller.
+that turn out to be outliers are then left out, since the Cauchy weight of many outliers with similar errors never
+vanishes. The scale of the cost is the configured one for the modelled noise, and less where the residuals are smaller.
 
 With ``motion.residuals: per_image``, as in the profile ``paper``, the minimum is that of eq. (2) or (3) as
 `graphvio.frontend.motion.paper_method` has them: of all points, each image by itself, all with the same scale. What
@@ -32,10 +32,10 @@ from graphvio.kernels import kernel
 from graphvio.linear_algebra import cholesky, eigen, product, solve_lower, solve_symmetric
 
 _MAX_ROUNDS = 3
-_MAX_REPETITIONS = 5  # of these rounds, where outliers stay in the cost and make convergence slow
+_MAX_REPETITIONS = 5  # of these rounds with residuals per image, where outliers in the cost make convergence slow
 _ROUNDS_TO_FIND_INLIERS = 5
 _ROUNDS_WITH_ALL = 2
-_GROSS = 4.0  # over the cutoff of inliers, as one pair's noise may be larger than that of all
+_GROSS = 4.0  # squared error over the inliers' cutoff, since one pair's noise may be larger than that of all
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # precise enough to determine inliers
@@ -43,7 +43,7 @@ _WEAK_DIRECTION_SIGMA = 10.0
 _MIN_SHARE_OF_A_PAIR = 0.25
 _MIN_POINTS_OF_A_PAIR = 5
 SHARED_BOUNDS = (0.02, 0.9)
-"""Of a covariance's part that motions from one reference share, over the covariance."""
+"""Bounds of the part of a covariance that motions from one reference share, over the covariance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +51,13 @@ class Refined:
     """A refined motion.
 
     Attributes:
-        cur_T_ref: (4, 4) of body.
+        cur_T_ref: (4, 4) motion of body.
         covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant. ``cur_T_ref``
             is the inverse of `RelativeMotion.reference_T_current`: the perturbation is on the right there, on the left
             here.
         shared_covariance: (6, 6) the part of it that all motions from the same reference have in common, since they
             depend on the same triangulated points.
-        inlier: (N,) the points that it explains.
+        inlier: (N,) the points that the motion explains.
         errors_px: (N,) each point's reprojection error in one direction, root mean square over its images, with the
             point's own uncertainty removed, so that the noise of the pixels remains. Infinite behind a camera, NaN for
             points that the motion was not tried on.
@@ -70,7 +70,7 @@ class Refined:
     errors_px: Float
 
     def rms_px(self, among: Bool | None = None) -> float | None:
-        """Compute the root mean square error of the inliers, all or among some points (N,); None without any."""
+        """Compute the root mean square error, pixels, of all inliers or of those among some points (N,), or None."""
         errors_px = self.errors_px[self.inlier if among is None else self.inlier & among]
         return float(np.sqrt(np.mean(errors_px**2))) if len(errors_px) else None
 
@@ -81,10 +81,10 @@ def refine(
     """Minimise the robust cost; directions that no point constrains get a large variance.
 
     Args:
-        rig: of P pairs.
+        rig: calibration of P pairs.
         observations: N points of any subset of them.
         cur_T_ref: initial motion (4, 4).
-        config: of this stage.
+        config: configuration of the motion stage.
         known_inlier: (N,) the inliers, where they are known already and the initial motion is near; else they are found
             first.
     """
@@ -100,7 +100,7 @@ def refine(
     in_front = np.isfinite(refined.errors_px)
     if in_front[refined.inlier].all():
         return refined
-    # The last step took points behind a camera, whose depth is hardly known: once more without them.
+    # The last step took points whose depth is hardly known behind a camera: refine once more without them.
     refined = Refined(*_refined(start, rig, observations, refined.inlier & in_front, shows_noise, *settings))
     return replace(refined, inlier=refined.inlier & np.isfinite(refined.errors_px))
 
@@ -114,15 +114,15 @@ def _refined(
 
     Args:
         cur_T_ref: (4, 4) initial motion.
-        rig: of P pairs.
+        rig: calibration of P pairs.
         observations: N points.
         known_inlier: (N,) the inliers; no elements where they are not known.
         shows_noise: (N,) points whose residuals show the noise; the depth of the others is so uncertain that it absorbs
             their error.
-        sigma: pixel noise as it is modelled.
-        scale_px: of the Cauchy cost.
-        max_error_px: of inliers.
-        inflation: of covariances.
+        sigma: modelled pixel noise.
+        scale_px: scale of the Cauchy cost for the modelled noise.
+        max_error_px: largest error of an inlier.
+        inflation: factor on the covariances.
     """
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right, blocks = observations.has_right, in_blocks(observations)
@@ -148,7 +148,7 @@ def _refined(
         if is_known or not is_last:
             scale = _scale(variance, widest)
         # Gross errors are left out as soon as they stand out: near the camera, they would bias the motion more in each
-        # round. The result is not to depend on the initial motion, by which other points would be taken for wrong.
+        # round. In the first rounds all points count: judged by the initial motion, other points would seem wrong.
         if not is_known and number >= _ROUNDS_WITH_ALL:
             inlier = errors2 < inlier_cutoff(variance, largest2) * (1.0 if is_last else _GROSS)
             if is_last:
@@ -177,7 +177,10 @@ def _refined_per_image(
     cur_T_ref: Float, rig: RigArrays, observations: Observations, known_inlier: Bool, images_rig: RigArrays,
     images: Observations, counted: Float, sigma: float, scale_px: float, max_error_px: float, inflation: float,
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
-    """As `_refined`, but at the minimum of eq. (2), of observations image by image (M,) of which some are counted."""
+    """Compute the fields of `Refined` at the minimum of eq. (2), over M observations in single images.
+
+    ``counted`` (M,) is 1 for the observations that the cost is summed over, else 0.
+    """
     blocks, pose = in_blocks(images), cur_T_ref
     points_at, active = allocate_points(blocks), lane_by_lane(blocks, counted)
     sigmas_px = np.full(len(images_rig.focal_px), sigma)
@@ -214,7 +217,7 @@ def _covariances(
     pose: Float, hessian: Float, errors2: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints,
     inlier: Bool, for_noise: Bool, has_right: Bool, sigmas_px: Float, scale: float,
 ) -> tuple[Float, Float]:  # fmt: skip
-    """Covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`.
+    """Compute the covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`.
 
     ``for_noise`` are the inliers (N,) from which the noise is estimated.
     """
@@ -240,14 +243,14 @@ def _covariances(
 def _scale(variance: float, widest: float) -> float:
     """Compute the scale of the Cauchy cost, less where the noise's variance is less than modelled.
 
-    A wrong point next to a camera has the leverage of a hundred others, and must look as wrong as it is.
+    An outlier next to a camera has the leverage of a hundred other points: its error must be compared with true noise.
     """
     return float(widest * np.sqrt(min(variance, 1.0)))
 
 
 @kernel
 def _is_of_an_explained_pair(pair: Int, inlier: Bool, pairs: int) -> Bool:
-    """Select the points (N,) of pairs of which more fit than would by chance; all points, if there is no such pair."""
+    """Select the points (N,) of pairs with more inliers than there would be by chance; all if there is no such pair."""
     points, fitting = np.zeros(pairs), np.zeros(pairs)
     for i in range(len(pair)):
         points[pair[i]] += 1.0
@@ -278,11 +281,11 @@ def _levenberg_marquardt(
     cur_T_ref: Float, rig: RigArrays, blocks: Blocks, points_at: LinearisationPoints, active: Float,
     sigmas_px: Float, scale: float, rounds: int, tolerance: float,
 ) -> tuple[Float, Float, Float]:  # fmt: skip
-    """Minimise the cost; in each round the places at which the points are linearised are found again.
+    """Minimise the cost in rounds, each of which begins with a relinearisation of the points.
 
     Returns:
-        Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum, except for the last step, which is
-        smaller than the tolerance; ``points_at`` are linearised where the last round began.
+        Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum. The last two are those before the
+        last step, which is smaller than the tolerance; ``points_at`` are those of the beginning of the last round.
     """
     pose = cur_T_ref.copy()
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
@@ -314,7 +317,7 @@ def _levenberg_marquardt(
                 pose = candidate
                 break
         if moved < _NEAR:
-            break  # the points' places and weights would not change any more
+            break  # relinearising the points would change nothing any more
     return pose, hessian, point_by_point(blocks, errors2)
 
 
@@ -331,7 +334,7 @@ def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, conf
 
 @kernel
 def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
-    """Convert squared whitened errors (N,) of points with a noise (N,) to pixels in one direction."""
+    """Convert squared whitened errors (N,) of points with pixel noise (N,) to errors in one direction, pixels."""
     errors_px = np.empty(len(errors2))
     for i in range(len(errors2)):
         errors_px[i] = sigmas_px[i] * np.sqrt(errors2[i] / (4.0 if has_right[i] else 2.0))

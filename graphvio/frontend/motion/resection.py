@@ -73,7 +73,7 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
 
 @kernel
 def _side_ratio(v: float, cos_a: float, cos_b: float, cos_g: float, a2_b2: float, c2_b2: float) -> float:
-    """Compute the u = s2 / s1 that side a demands, of its two values the one that fits side c better."""
+    """Compute ``u = s2 / s1`` from side a: of its two solutions, the one that fits side c better."""
     first = 1.0 + v * v - 2.0 * v * cos_b
     half = np.sqrt(max((v * cos_a) ** 2 - v * v + a2_b2 * first, 0.0))
     best, least = 0.0, np.inf
@@ -104,7 +104,7 @@ def _align_triangles(points: Float, axes_a: Float, seen: Float, axes_cam: Float,
 
 @kernel
 def _triangle_axes(corners: Float, axes: Float) -> bool:
-    """Fill orthonormal axes (rows) attached to a triangle; False if it is a line."""
+    """Fill orthonormal axes (rows) attached to a triangle; False if its corners are on a line."""
     for c in range(3):
         axes[0, c] = corners[1, c] - corners[0, c]
         axes[1, c] = corners[2, c] - corners[0, c]
@@ -127,7 +127,7 @@ def _normalise(v: Float) -> float:
 
 @kernel
 def _cross(a: Float, b: Float, out: Float) -> None:
-    """Fill the cross product; ``np.cross`` makes a new array."""
+    """Fill the cross product; unlike ``np.cross``, this makes no new array."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]

@@ -1,4 +1,4 @@
-"""One motion from all pairs: the best pair's (section 3, eq. 3 and 4), or all pairs jointly (section 3.1)."""
+"""Estimation of one motion from all pairs: the best pair's (section 3, eq. 3 and 4), or jointly (section 3.1)."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from graphvio.frontend.motion.observations import Observations, RigArrays, is_de
 from graphvio.frontend.motion.ransac import search
 from graphvio.frontend.motion.refinement import Refined, explained, refine
 
-_MIN_SIGMAS = 3.0  # of a translation by whose flow depths are seen
+_MIN_SIGMAS = 3.0  # of a translation, beyond which its flow shows depths
 
 
 def searched_and_refined(
@@ -23,10 +23,10 @@ def searched_and_refined(
     Hypotheses are scored on every pair, and the best one is refined.
 
     Args:
-        rig: of P pairs.
-        observations: of any subset of them.
-        predicted: ``cur_T_ref`` (4, 4), one more hypothesis.
-        config: of this stage.
+        rig: calibration of P pairs.
+        observations: points of any subset of them.
+        predicted: predicted ``cur_T_ref`` (4, 4), used as one more hypothesis.
+        config: configuration of the motion stage.
         rng: source of the random triples.
     """
     has_known_depth = is_depth_known(rig, observations, config.pixel_sigma_px)
@@ -39,12 +39,13 @@ def searched_and_refined(
 def joint_motion(
     rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> tuple[Refined, Observations]:
-    """Estimate a motion as `searched_and_refined`, where single cameras' points may hardly have a depth yet.
+    """Estimate a motion as `searched_and_refined` does, while single cameras' points may hardly have a depth yet.
 
-    The flow of such a point is any that the translation can explain. Where the translation is about zero, its error
-    decides, and the minimum would lie where the noise of these points is explained best. So the motion is estimated
-    by the other points first, and what is not known of its translation counts as noise of their rays. The scale of
-    these cameras' depths is unknown in any case (`graphvio.frontend.motion.depth_scale`).
+    The flow of a point of unknown depth may be any that some depth explains for the given translation. If the
+    translation is about zero, its error determines these flows, and the minimum would be where the noise of such points
+    is explained best. So the motion is first estimated from the other points, and the uncertainty of its translation is
+    added to the rays of points of unknown depth as noise. The common scale of a single camera's depths is unknown in
+    any case (`graphvio.frontend.motion.depth_scale`).
 
     Returns:
         The motion on all points, and the observations with that noise.
@@ -64,21 +65,22 @@ def joint_motion(
 
 
 def _with_noise_of_motion(covariances: Float, pair: Int, rig: RigArrays, first: Refined, sigma_px: float) -> Float:
-    """Return covariances (V, 3, 3) of points of vague depth with what is not known of a motion's translation.
+    """Return covariances (V, 3, 3) of points of vague depth, enlarged by the uncertainty of a motion's translation.
 
     Args:
-        covariances: (V, 3, 3) for a pixel noise of 1 px.
-        pair: (V,) their cameras.
-        rig: of P pairs and cameras.
-        first: the motion by other points.
-        sigma_px: pixel noise as it is modelled. Where there is less, the depths are as vague all the same.
+        covariances: (V, 3, 3) of the points, for a pixel noise of 1 px.
+        pair: (V,) indices of their cameras.
+        rig: calibration of P pairs and single cameras.
+        first: the motion, estimated from other points.
+        sigma_px: modelled pixel noise. If the actual noise is smaller, the depths are scaled to stay as vague as with
+            the modelled one.
     """
     scale = np.array([1.0, 1.0, max(sigma_px / (first.rms_px() or sigma_px), 1.0)])
     vague = covariances * np.outer(scale, scale)
     translation = camera_motions(first.cur_T_ref, rig)[:, 0, :3, 3]
     variance = np.linalg.eigvalsh(first.covariance[3:, 3:])[-1]
     stands_out = np.maximum((translation**2).sum(axis=1) - _MIN_SIGMAS**2 * variance, 0.0)
-    flow = (rig.focal_px[:, 0] ** 2 * stands_out)[pair]  # what it shows of inverse depths
+    flow = (rig.focal_px[:, 0] ** 2 * stands_out)[pair]  # its information about inverse depths
     vague[:, :2, :2] += (variance / (1.0 / vague[:, 2, 2] + flow))[:, None, None] * np.eye(2)
     return np.asarray(vague)
 

@@ -1,5 +1,5 @@
-"""Pairs against each other: whether they agree, and where they are in body.
+"""Comparison of the pairs' motions with each other, and the extrinsics between pairs.
 
 `agreement` finds consensus sets of pairs. `extrinsics` has the poses of the cameras in body that are in force, and
-`extrinsic_monitor` tests the transfer between pairs. `pair_reports` reports what each pair contributed.
+`extrinsic_monitor` tests and corrects the transfer between pairs. `pair_reports` reports what each pair contributed.
 """

@@ -1,9 +1,9 @@
-"""Whether the pairs agree: each pair's own motion against the others', by their covariances.
+"""Agreement of the pairs: each pair's own motion is compared with the others', by their covariances.
 
-Pairs that see rigid scenes measure one motion. Where their motions differ, a door or a crowd fills a view and moves,
-images are late, or the transfer between the pairs, eq. (1), is wrong. A motion refined on all points would then be
-right for none of them: the motion of each consensus set is kept as a hypothesis, and the better-supported one comes
-first, as in eq. (4).
+Pairs that see a rigid scene all measure the same motion. If their motions differ, something that moves, such as a door
+or a crowd, fills a view, or images are late, or the transfer between the pairs, eq. (1), is wrong. A motion refined on
+all points would then be right for no pair. Instead, the motion of each consensus set is kept as a hypothesis, and the
+better-supported one comes first, as in eq. (4).
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,8 @@ class MotionHypothesis:
 
     Attributes:
         pairs: Indices of the pairs, increasing.
-        refined: The motion on their points; ``inlier`` (N,) covers the points of all pairs, False for other sets'.
+        refined: The motion refined on their points; ``inlier`` (N,) covers the points of all pairs, and is False for
+            points of other consensus sets.
     """
 
     pairs: tuple[int, ...]
@@ -47,14 +48,15 @@ class MotionHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """The motions of all pairs.
+    """The motions of all pairs, compared with each other.
 
     Attributes:
-        hypotheses: One if all pairs that see enough agree; else one for each consensus set, the best supported first.
-            Of comparable ones the pair of the lowest index comes first, as the extrinsics are relative to pair 0.
-        own: Pair index -> its own motion, of the pairs that see enough, as if its extrinsics were exact.
+        hypotheses: One if all pairs with enough inliers agree; else one for each consensus set, the best supported
+            first. Among sets of comparable support, the one with the lowest pair index comes first, since extrinsics
+            are relative to pair 0. If many points fit none of them, a second rigid motion is one more hypothesis.
+        own: Pair index -> its own motion, for pairs with enough inliers, as if the extrinsics were exact.
         max_distance: Largest squared Mahalanobis distance between two pairs of a consensus set, 0 for a single pair.
-        contradicts: Whether two pairs are beyond 5 sigma of each other.
+        contradicts: Whether the motions of two pairs differ by more than 5 sigma.
     """
 
     hypotheses: tuple[MotionHypothesis, ...]
@@ -75,14 +77,15 @@ def agree(
     """Compare the pairs' own motions, and return the motion of each consensus set.
 
     Args:
-        rig: P pairs.
+        rig: Calibration of P pairs.
         observations: Points of any subset of them.
         joint: Motion on all these points, from `graphvio.frontend.motion.selection.joint_motion`.
         config: Configuration of the motion stage.
         rng: Source of random triples.
-        uncertain: Pair index -> covariance (6, 6) of an error d of its extrinsics, which are ``exp(d) body_T_left``, of
-            pairs whose extrinsics have been corrected or are not known exactly.
-        in_doubt: Whether the pairs contradicted each other a moment ago: a smaller distance then separates them.
+        uncertain: Pair index -> covariance (6, 6) of the error d of its extrinsics, which are ``exp(d) body_T_left``,
+            for pairs whose extrinsics have been corrected or are not known exactly.
+        in_doubt: Whether the pairs contradicted each other a moment ago; the largest distance of motions that agree is
+            then smaller.
     """
     everyone = observations.pairs
     own: dict[int, Refined] = {}
@@ -114,7 +117,7 @@ def agree(
 
 
 def _consensus_sets(pairs: Sequence[int], apart: Mapping[tuple[int, int], float], in_doubt: bool) -> list[list[int]]:
-    """Gather pairs, the best supported first, so that within a set each agrees with every other."""
+    """Group pairs, given with the best supported first, into sets in which each pair agrees with every other."""
     limit = _T.max_distance_in_doubt if in_doubt else _T.max_distance
     sets: list[list[int]] = []
     for j in pairs:
@@ -128,9 +131,10 @@ def _consensus_sets(pairs: Sequence[int], apart: Mapping[tuple[int, int], float]
 
 
 def _in_order(hypotheses: list[MotionHypothesis], unknown: frozenset[int] = frozenset()) -> list[MotionHypothesis]:
-    """Sort by support, but comparable ones by their lowest pair, and last those of cameras of unknown extrinsics only.
+    """Sort hypotheses by support, or by their lowest pair if their support is comparable.
 
-    With wrong extrinsics several pairs are right, and alternating between them would accumulate the error.
+    With wrong extrinsics, each of several pairs measures its own motion correctly, and alternating between them would
+    accumulate the error. Hypotheses of only ``unknown`` groups, single cameras of unknown extrinsics, come last.
     """
     last = [hypothesis for hypothesis in hypotheses if unknown.issuperset(hypothesis.pairs)]
     hypotheses = [hypothesis for hypothesis in hypotheses if not unknown.issuperset(hypothesis.pairs)] or last
@@ -148,7 +152,7 @@ def disagreement(one: Refined, other: Refined) -> float:
 
 
 def is_supported(inlier: Bool, config: MotionConfig) -> bool:
-    """Whether a motion explains enough of the points (N,) that it was estimated from."""
+    """Return whether a motion explains enough of the points (N,) that it was estimated from."""
     return bool(inlier.sum() >= max(config.min_inliers, config.min_inlier_share * len(inlier)))
 
 
@@ -173,7 +177,7 @@ def _own_motion(
 
 
 def _own_motion_of_single(rig: RigArrays, seen: Observations, joint: Refined, config: MotionConfig) -> Refined:
-    """Refine the joint motion on the points of a single camera whose depth is known; of the others it says nothing."""
+    """Refine the joint motion on the points of a single camera whose depth is known; others are not tested."""
     known = seen.has_known_depth(config.pixel_sigma_px)
     if not known.any():
         return replace(joint, inlier=np.zeros(len(known), dtype=bool), errors_px=np.full(len(known), np.nan))
@@ -209,7 +213,10 @@ def _second_motion(
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> MotionHypothesis | None:
-    """Find one more rigid motion, of most points that none explains: the world's, or that of an object."""
+    """Find one more rigid motion that most of the unexplained points follow, or return None.
+
+    It may be the motion relative to the world, or relative to an object that moves.
+    """
     errors_px = np.fmin.reduce([each.refined.errors_px for each in hypotheses])
     unlike = ~(errors_px < _T.min_unlike_px)
     unexplained = unlike & ~np.any([each.refined.inlier for each in hypotheses], axis=0)
@@ -223,7 +230,7 @@ def _second_motion(
 
 
 def _spread_over(rows: Bool, refined: Refined) -> Refined:
-    """Spread the inliers and errors of some rows' points over all points."""
+    """Extend the inliers and errors of a motion from the points in some rows, a mask (N,), to all N points."""
     inlier, errors_px = np.zeros(len(rows), dtype=bool), np.full(len(rows), np.nan)
     inlier[rows], errors_px[rows] = refined.inlier, refined.errors_px
     return replace(refined, inlier=inlier, errors_px=errors_px)

@@ -1,8 +1,8 @@
 """Online monitoring of the extrinsics between pairs: whether their own motions fit one rigid body with the rig's P_12.
 
-With an error ``d`` of ``body_T_left`` (from the left, in body), a pair measures the motion ``exp(-d) M exp(d)`` where
-the rig's is M. Motions over whole keyframes, which share next to no noise, are collected, and d is their robust
-least-squares solution by Gauss-Newton: as in section 4, for small errors.
+With an error ``d`` of ``body_T_left`` (multiplied from the left, in body), a pair measures the motion
+``exp(-d) M exp(d)`` when the rig's motion is M. Motions over whole keyframes, which share next to no noise, are
+collected, and d is estimated from them by robust least squares with Gauss-Newton, as in section 4 but for small errors.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class ExtrinsicError(NamedTuple):
     statistic: float
 
     def refutes(self, other: ExtrinsicError) -> bool:
-        """Whether the other error is significantly different."""
+        """Return whether another error differs significantly from this one."""
         apart = self.tangent - other.tangent
         return float(apart @ np.linalg.solve(self.covariance, apart)) > _T.max_chance_distance
 
@@ -46,7 +46,7 @@ class ExtrinsicError(NamedTuple):
 class ExtrinsicMonitor:
     """Estimates the error of a pair's extrinsics relative to another pair, from the motions of both.
 
-    The extrinsics are taken as they are unless chance explains an error less than once in 10^9.
+    The extrinsics are taken as they are, unless exact ones would show such an error less than once in 10^9 cases.
 
     Attributes:
         in_force: The error that the pair's motions are corrected for from now on, or None.
@@ -62,14 +62,14 @@ class ExtrinsicMonitor:
         return np.eye(4) if self.in_force is None else se3_exp(self.in_force.tangent)
 
     def add(self, trusted: Refined, pair: Refined) -> None:
-        """Add two motions over the same keyframe, the pair's computed with the correction in force."""
+        """Add the motions of the trusted pair and of this pair, corrected by the error in force, over one keyframe."""
         correction = self.correction
         uncorrected = se3_inverse(correction) @ pair.cur_T_ref @ correction
         whitener = np.linalg.inv(np.linalg.cholesky(trusted.covariance + pair.covariance))
         self._motions.append((trusted.cur_T_ref, uncorrected, whitener))
 
     def learn(self) -> bool:
-        """Put a significant error into force, or a refuted one out of it, and return whether that changes anything."""
+        """Set ``in_force`` to a significant error, or to None if it is refuted; return whether it has changed."""
         found = self.solve()
         if found is None:
             return False
@@ -102,7 +102,7 @@ class ExtrinsicMonitor:
 
 
 def warm_up_extrinsic_monitor(motion: Refined) -> None:
-    """Compile the kernels of `ExtrinsicMonitor` by a motion without information, for the warm-up."""
+    """Compile the kernels of `ExtrinsicMonitor` for the warm-up, by adding a motion that shows no error."""
     monitor = ExtrinsicMonitor()
     for _ in range(_T.min_motions):
         monitor.add(motion, motion)
@@ -131,7 +131,7 @@ def describe(rig: Rig, pair: int, error: ExtrinsicError) -> str:
 
 
 def placed(motion: Refined, extrinsics_covariance: Float | None) -> Refined:
-    """Enlarge the covariance of a pair's motion by that of its extrinsics (6, 6), None where these are exact."""
+    """Enlarge the covariance of a pair's motion by the effect of its extrinsics' covariance (6, 6), None if exact."""
     if extrinsics_covariance is None:
         return motion
     lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
@@ -139,13 +139,13 @@ def placed(motion: Refined, extrinsics_covariance: Float | None) -> Refined:
 
 
 def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
-    """Combine the motions of pairs, some of which have been corrected, each weighed by its covariance, see `placed`.
+    """Combine the motions of pairs, some of which have been corrected, weighted by their covariances, see `placed`.
 
-    Refining on the points of all pairs would weigh them as if the corrections were exact.
+    Refining on the points of all pairs would weight them as if the corrections were exact.
 
     Args:
-        joint: Motion on all points, which has the inliers.
-        motions: Motion of each pair alone.
+        joint: Motion on all points, whose inliers and errors are kept.
+        motions: Own motion of each pair.
     """
     first = motions[0].cur_T_ref
     information, weighted, through_points = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
@@ -165,9 +165,9 @@ def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
 
 @kernel
 def _linearised(correction: Float, trusted: Float, pairs: Float, whiteners: Float) -> tuple[Float, Float]:
-    """Return whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and derivatives.
+    """Return whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and their derivatives.
 
-    These (N, 6, 6) are with respect to one more correction from the left.
+    The derivatives (N, 6, 6) are with respect to one more correction, multiplied from the left.
     """
     n = len(trusted)
     errors, derivatives = np.empty((n, 6)), np.empty((n, 6, 6))

@@ -1,4 +1,4 @@
-"""Poses of the cameras in body as motions are estimated with: the rig's, and what the cameras' own motions correct."""
+"""Poses of the cameras in body that motions are estimated with: the rig's, corrected by the cameras' own motions."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from graphvio.rig import Rig
 
 
 class RigExtrinsics:
-    """Where pairs and single cameras are on the rig, and how well that is known.
+    """Extrinsics of the pairs and single cameras, with their uncertainty.
 
-    Where self-calibration is on, it finds errors of the extrinsics, and they are not monitored here.
+    If self-calibration is on, it finds errors of the extrinsics, and they are not monitored here.
 
     Args:
         rig: Stereo pairs and single cameras.
         config: Configuration of all stages.
 
     Attributes:
-        arrays: The rig, with the corrections that are in force.
-        uncertain: Index -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``, of those that are
-            corrected or estimated.
+        arrays: Calibration of the rig, with the corrections that are in force.
+        uncertain: Group index -> covariance (6, 6) of the error d of its extrinsics ``exp(d) body_T_left``, for groups
+            whose extrinsics are corrected or estimated.
     """
 
     def __init__(self, rig: Rig, config: Config) -> None:
@@ -38,11 +38,11 @@ class RigExtrinsics:
 
     @property
     def extrinsic_errors(self) -> Mapping[int, ExtrinsicError]:
-        """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
+        """Errors of the extrinsics relative to the first pair, by group index; motions are corrected for them."""
         return {j: monitor.in_force for j, monitor in self._monitors.items() if monitor.in_force is not None}
 
     def recalibrate(self, rig: Rig, uncertain: Mapping[int, Float]) -> None:
-        """Use another calibration of the cameras, and covariances (6, 6) relative to the first pair's extrinsics."""
+        """Use another calibration: the rig, and group index -> covariance (6, 6) relative to the first pair."""
         self._nominal = RigArrays.of(rig)
         self.arrays = self._nominal
         self.uncertain = uncertain
@@ -51,7 +51,7 @@ class RigExtrinsics:
                 self._correct(j)
 
     def learn(self, own: Mapping[int, Refined]) -> None:
-        """Compare motions over a keyframe with the first pair's, and correct extrinsics that they refute."""
+        """Compare the groups' own motions over a keyframe with the first pair's, and correct wrong extrinsics."""
         if 0 not in own:
             return
         for j, monitor in self._monitors.items():
@@ -62,7 +62,7 @@ class RigExtrinsics:
                 self._correct(j)
 
     def uncorrected(self, j: int, own: Refined) -> Refined:
-        """Return a pair's own motion as it is without the correction in force."""
+        """Return a pair's own motion by the rig's extrinsics, without the correction in force."""
         back = se3_inverse(self._monitors[j].correction) if j in self._monitors else np.eye(4)
         adjoint = se3_adjoint(back)
         return replace(
@@ -72,7 +72,7 @@ class RigExtrinsics:
         )
 
     def _correct(self, j: int) -> None:
-        """Apply the correction in force of one pair or single camera, or none."""
+        """Apply the correction in force of one pair or single camera; remove it if there is none any more."""
         monitor = self._monitors[j]
         self.arrays = self.arrays.corrected(self._nominal, j, monitor.correction)
         others = {i: covariance for i, covariance in self.uncertain.items() if i != j}

@@ -1,4 +1,4 @@
-"""What each pair contributed to a frameset, for those who watch a run."""
+"""Reports of what each pair contributed to a frameset, for monitoring a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from graphvio.measurements.motion import PairReport
 
 
 def inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:
-    """Return which of a pair's points (M,) are inliers of its own motion; of a single camera, of the rig's."""
+    """Return which of a pair's points (M,) are inliers of its own motion.
+
+    Where there is no own motion, and for a single camera, they are the inliers of the rig's motion.
+    """
     if pair in agreement.own and pair not in correspondences.singles:
         return agreement.own[pair].inlier
     return np.asarray(agreement.hypotheses[0].refined.inlier[correspondences.observations.pair == pair])
@@ -31,9 +34,10 @@ def pair_reports(
 
     Args:
         frames: Pair index -> its tracks.
-        correspondences: Points of them that the references have, too.
+        correspondences: Points that both these tracks and the references have.
         agreement: Motions of the pairs, or None without a motion.
-        replenished: Pair index -> tracks with new corners, whose search rejected some; empty without a search.
+        replenished: Pair index -> tracks with new corners, and with the number of those that were rejected; empty if no
+            corners were searched for.
     """
     reports = {j: _report(frame, correspondences, j, agreement) for j, frame in frames.items()}
     return {

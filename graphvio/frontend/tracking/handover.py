@@ -1,7 +1,7 @@
-"""Points that tracks of several single cameras follow: what leaves one camera's view goes on in another's.
+"""Handover of tracks between single cameras: a point that leaves one camera's view is followed in another's.
 
-A camera adopts points where it has no track of its own, at the place where another camera's track was found in its
-image. Its track then is of the same point, and goes on when the other one ends.
+A camera adopts a point at the place where another camera's track was found in its image, if it has no track of its own
+there. Its new track follows the same point, and goes on when the other camera's track ends.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Leaving(NamedTuple):
 
     Attributes:
         ids: (N,) identities, increasing.
-        inverse_depths: (N,) as the camera's own motion shows them, 1/m.
-        sigmas: (N,) of these.
+        inverse_depths: (N,) computed from the camera's own motion, 1/m.
+        sigmas: (N,) standard deviations of the inverse depths, 1/m.
     """
 
     ids: Int
@@ -34,13 +34,13 @@ class Leaving(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FoundThere:
-    """Tracks of one camera in another one's image.
+    """Tracks of one camera that were found in another camera's image.
 
     Attributes:
         camera: index of the camera that has the tracks.
-        ids: (N,) identities of these, increasing.
-        pixels: (N, 2) in the other camera's image.
-        inverse_depths: (N,) there, 1/m.
+        ids: (N,) identities of the tracks, increasing.
+        pixels: (N, 2) where they were found in the other camera's image.
+        inverse_depths: (N,) in the other camera's frame, 1/m.
     """
 
     camera: int
@@ -50,15 +50,15 @@ class FoundThere:
 
 
 class Handover:
-    """Knows which camera's track began each adopted point.
+    """Records which camera's track each adopted point comes from.
 
     Args:
-        n_cameras: of the rig.
+        n_cameras: number of cameras of the rig.
     """
 
     def __init__(self, n_cameras: int) -> None:
         none = np.zeros(0, dtype=np.int64)
-        self._handed_over = [HandedOverTracks(none, none, none) for _ in range(n_cameras)]  # whose rows are identities
+        self._handed_over = [HandedOverTracks(none, none, none) for _ in range(n_cameras)]  # here `rows` are ids
 
     def handed_over(self, camera: int, frame: TrackedFrame) -> HandedOverTracks:
         """Return the tracks of a frame that follow points of other cameras' tracks."""
@@ -69,7 +69,7 @@ class Handover:
         return known._replace(rows=at[stays])
 
     def is_followed(self, camera: int, frames: Mapping[int, TrackedFrame]) -> Bool:
-        """Select the tracks (N,) of a camera whose point is still in the view of the camera that began it."""
+        """Select the tracks (N,) of a camera whose point is still followed by the camera that it comes from."""
         rows, cameras, ids = self.handed_over(camera, frames[camera])
         followed = np.zeros(len(frames[camera].ids), dtype=bool)
         for k in np.unique(cameras):
@@ -81,16 +81,16 @@ class Handover:
     def adopt(
         self, camera: int, tracker: GroupTracker, frames: Mapping[int, TrackedFrame], found: Iterable[FoundThere]
     ) -> TrackedFrame:
-        """Let a camera's tracker follow points that other cameras' tracks have in its image, where it has none.
+        """Let a camera's tracker follow points of other cameras' tracks in its image, where it has no track.
 
         Args:
             camera: index of the camera.
-            tracker: of this camera.
-            frames: tracks of all cameras.
-            found: other cameras' tracks in the image of this one.
+            tracker: the tracker of this camera.
+            frames: camera index -> tracks, of all cameras.
+            found: other cameras' tracks that were found in the image of this camera.
 
         Returns:
-            The camera's tracks.
+            The camera's tracks, with the adopted points.
         """
         own = self.handed_over(camera, frames[camera])
         followed = set(zip(own.cameras.tolist(), own.ids.tolist(), strict=True))

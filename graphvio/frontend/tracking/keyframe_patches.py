@@ -1,4 +1,4 @@
-"""The patches of a keyframe, on which tracks are registered, and the slant of the surfaces that they show."""
+"""Patches of a keyframe, on which tracks are registered in later images, and the slant of their surfaces."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from graphvio.frontend.imaging.sampling import PixelWords, pixel_words
 from graphvio.rig import CameraGroup, SingleCamera
 
 _MAX_REGISTRATION_PX = 2.0
-_SAME_PATCH = 0.8  # correlation of the patches
-_MAX_OFF_PX = 1.0  # distance of a patch from where a motion has it
-_MIN_APART_PX = 4.0  # distance of two places that are not the same
+_SAME_PATCH = 0.8  # smallest correlation of a patch with the place where it is found
+_MAX_OFF_PX = 1.0  # largest distance of a patch from where a motion predicts it
+_MIN_APART_PX = 4.0  # smallest distance of two different places
 
 
 class KeyframePatches:
@@ -52,9 +52,10 @@ class KeyframePatches:
         """Store the patches of a frame's tracks.
 
         Args:
-            frame: the new keyframe.
+            frame: tracks of the new keyframe.
             image: (height, width) its left image.
-            motion: (4, 4) of points since the keyframe before, by which a single camera's slants are handed on.
+            motion: (4, 4) motion of points since the previous keyframe, by which the slants of a single camera's
+                patches are transferred, or None.
         """
         kept = image.copy()  # a driver may fill its buffer again
         self._image = pixel_words(kept)
@@ -68,7 +69,7 @@ class KeyframePatches:
         self._place(self._frame.recalibrated(group), np.eye(4))
 
     def _place(self, frame: TrackedFrame, motion: Float | None) -> None:
-        """Place the patches in space, by a frame's tracks and the motion since the frame before, if it is known."""
+        """Compute rays and inverse depths around a frame's tracks, by the motion since the last keyframe, if known."""
         ids, rays, inverse_depths = self._frame.ids, self._rays, self._inverse_depths
         self._frame = frame
         pixels = around(frame.pixels, self._step_px)
@@ -96,12 +97,12 @@ class KeyframePatches:
         )
 
     def slant(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
-        """Set the depth of patches of a single camera, and their slant, as another camera sees them.
+        """Set the depth and the slant of a single camera's patches, as measured by matches in another camera.
 
         Args:
-            found: tracks of the keyframe, matched in the other camera.
-            cameras: this one, and the other.
-            is_slope_known: whether the matches' slopes mean something; else patches keep the slants that they have.
+            found: tracks of the keyframe, with their matches in the other camera.
+            cameras: this camera as the left one, and the other.
+            is_slope_known: whether the matches' slopes were measured; else patches keep the slants that they have.
         """
         rows = np.minimum(np.searchsorted(self._frame.ids, found.ids), max(len(self._frame.ids) - 1, 0))
         kept = self._frame.ids[rows] == found.ids if len(self._frame.ids) else np.zeros(len(rows), dtype=bool)
@@ -139,7 +140,7 @@ class KeyframePatches:
             min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
 
         Returns:
-            Pixels (N, 2), equal to the guess where there is no patch or it is not found, and which were found (N,).
+            Pixels (N, 2), equal to the guess where there is no patch or it is not found; and which were found (N,).
         """
         pixels, found, rows = self._registered(ids, guess, image, left_T_left_keyframe, min_gradient)
         if self._slants is not None and found.any():
@@ -152,15 +153,15 @@ class KeyframePatches:
     def are_also_at(
         self, keyframe_ns: int, ids: Int, pixels: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
     ) -> Bool:
-        """Return which tracks (N,) were followed elsewhere than where a motion has them, and are seen there, too.
+        """Return which tracks (N,) were followed to one place, but are also found at another that a motion predicts.
 
         Args:
-            keyframe_ns: stamp of the keyframe; of another one there are no patches.
+            keyframe_ns: stamp of the keyframe since which the motion is; without its patches, no track is selected.
             ids: (N,) the tracks.
             pixels: (N, 2) to which they were followed.
             image: (height, width), left.
             left_T_left_keyframe: (4, 4) motion of points since the keyframe.
-            min_gradient: as for `find`.
+            min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
         """
         frame, camera = self._frame, self._group.left
         if frame.stamp_ns != keyframe_ns or not len(frame.ids):
@@ -178,7 +179,7 @@ class KeyframePatches:
     def _registered(
         self, ids: Int, guess: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
     ) -> tuple[Float, Bool, Int]:
-        """Return pixels and which tracks were found, as `find`, and their rows (N,) in the keyframe."""
+        """Return pixels and which tracks were found, as `find` does, and the tracks' rows (N,) in the keyframe."""
         frame = self._frame
         if self._image is None or not len(frame.ids) or not len(ids):
             return guess.copy(), np.zeros(len(ids), dtype=bool), np.zeros(len(ids), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Where tracks are that a wrong prediction has lost: by those that were found, or by the whole image."""
+"""Where to search for tracks that a wrong prediction has lost: by the found tracks, or by the shift of the image."""
 
 import cv2
 import numpy as np
@@ -7,23 +7,23 @@ from graphvio.arrays import Bool, Float, Image
 
 _MIN_TRACKS = 8
 _MIN_INLIERS, _MIN_INLIER_SHARE = 8, 0.4
-_MAX_ERROR_PX = 4.0  # of tracks through blurred images
-_MIN_INVERSE_DEPTH = 1e-3  # 1/m, of a point at infinity
+_MAX_ERROR_PX = 4.0  # reprojection error, of tracks through blurred images
+_MIN_INVERSE_DEPTH = 1e-3  # 1/m, of points at infinity or of unknown depth
 _ITERATIONS = 200
 
 
 def motion_of_found(rays: Float, inverse_depths: Float, seen: Float, found: Bool, focal_px: float) -> Float | None:
-    """Estimate the motion of points in a camera since the images before, by 3-point poses of random triples.
+    """Estimate the motion of points in a camera since the previous image, by RANSAC with 3-point poses.
 
     Args:
-        rays: (N, 2) normalised coordinates then.
-        inverse_depths: (N,) then, 1/m, 0 where unknown.
+        rays: (N, 2) normalised coordinates in the previous image.
+        inverse_depths: (N,) there, 1/m, 0 where unknown.
         seen: (N, 2) normalised coordinates now.
-        found: (N,) which tracks are seen.
-        focal_px: of the camera.
+        found: (N,) which tracks were found now.
+        focal_px: focal length of the camera.
 
     Returns:
-        ``now_T_then`` (4, 4), or None where too few tracks move as one.
+        ``now_T_then`` (4, 4), or None where too few tracks fit one motion.
     """
     if found.sum() < _MIN_TRACKS:
         return None
@@ -43,12 +43,12 @@ def motion_of_found(rays: Float, inverse_depths: Float, seen: Float, found: Bool
 def image_shift(before: Image, now: Image) -> Float:
     """Measure the shift (2,) in pixels of an image's content by phase correlation.
 
-    A turn about an axis across the view shifts all of the content alike. Of images that have little in common it may be
-    any shift.
+    A rotation about an axis perpendicular to the optical axis shifts all of the content alike. If the images have
+    little in common, the result may be any shift.
 
     Args:
-        before: (height, width) of a small image, such as the coarsest level of a pyramid.
-        now: (height, width).
+        before: (height, width) the previous image, small, such as the coarsest level of a pyramid.
+        now: (height, width) the newest image, of the same size.
     """
     height, width = before.shape
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)

@@ -1,4 +1,4 @@
-"""How body moves while rolling shutters read images out, by the motion that the images themselves measure."""
+"""Motion of body while rolling shutters read images out, computed from the motions that the images measure."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from graphvio.arrays import Float
 from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
 from graphvio.geometry import se3_inverse, so3_log
 
-_MIN_READOUTS_BETWEEN = 2.0  # framesets, or errors of one's velocity make larger ones of the next
+_MIN_READOUTS_BETWEEN = 2.0  # framesets, in readout times: nearer ones amplify errors of the velocity step by step
 _LONGEST_NS = 500_000_000
-_SIGMA_M_S = 0.05  # of a velocity by framesets before and after, or with an IMU's acceleration
+_SIGMA_M_S = 0.05  # of a velocity from framesets before and after, or with an IMU's acceleration
 _ACCELERATION_SIGMA = 3.0  # m/s^2
 
 
 @dataclass(frozen=True, eq=False)
 class _Frameset:
-    """Pose of body in the chain's first frameset, and the readout's motion by the IMU, if one measures it."""
+    """Pose of body relative to the chain's first frameset, and the readout motion by the IMU, if one measures it."""
 
     origin_T_body: Float
     by_imu: ReadoutMotion | None
 
 
 class MeasuredReadouts:
-    """Chain of measured motions, which shows the velocities at its framesets.
+    """Chain of measured motions, from which the velocities at its framesets are computed.
 
-    A velocity that the state predicts depends on the motions that were measured with earlier ones: where these were
-    wrong, it makes the next one wrong, and the IMU and vision contradict each other more and more. That of the measured
-    poses is corrected with them.
+    A velocity that the state estimator predicts depends on motions that were measured with earlier velocities. If these
+    were wrong, it makes the next motion wrong, too, and the IMU and vision contradict each other more and more. A
+    velocity that is computed from the measured poses is corrected together with them.
 
     Args:
-        readout_ns: the longest of the rig.
+        readout_ns: longest readout time of the rig's cameras.
     """
 
     def __init__(self, readout_ns: int) -> None:
@@ -46,13 +46,13 @@ class MeasuredReadouts:
         reference_T_body: Float,
         by_imu: tuple[ReadoutMotion | None, ReadoutMotion | None],
     ) -> None:
-        """Note a motion, or that it is measured again.
+        """Add a measured motion, or replace it after it has been measured again.
 
         Args:
             reference_ns: stamp of the frameset that it is measured from.
             stamp_ns: stamp of the newest frameset.
-            reference_T_body: (4, 4) pose of body at the newest frameset.
-            by_imu: turn and acceleration by an IMU at the newest frameset and at the reference, or None.
+            reference_T_body: (4, 4) pose of body at the newest frameset, in body at the reference.
+            by_imu: readout motions that an IMU measured at the newest frameset and at the reference, or None.
         """
         if reference_ns not in self._framesets:
             self._framesets = {reference_ns: _Frameset(np.eye(4), by_imu[1])}
@@ -64,10 +64,14 @@ class MeasuredReadouts:
         }
 
     def at(self, stamp_ns: int) -> ReadoutMotion | None:
-        """Return the motion at a frameset, by one before and one after it, or by one of them; None if there is none.
+        """Return the readout motion at a frameset, computed from one before and one after it, or from one of them.
 
-        By an IMU's acceleration, the mean velocity between framesets becomes that at one of them. Without it, the way
-        from the frameset is a quadratic function of time between two others, and a linear one to a single other.
+        With an IMU, its acceleration converts the mean velocity between two framesets into the velocity at this one.
+        Without an IMU, the motion from this frameset is a quadratic function of time if there are two others, and a
+        linear one if there is one.
+
+        Returns:
+            The motion, or None if the frameset is unknown or there is no other one near it.
         """
         here, others = self._framesets.get(stamp_ns), self._next_to(stamp_ns)
         if here is None or not others:
@@ -91,7 +95,7 @@ class MeasuredReadouts:
         return replace(here.by_imu, velocity=velocities.mean(axis=0), velocity_covariance=_SIGMA_M_S**2 * np.eye(3))
 
     def _next_to(self, stamp_ns: int) -> list[int]:
-        """Return the stamps of the next frameset before and after one that are not too near, if there are any."""
+        """Return the stamps of the nearest frameset before and after a stamp, neither too near nor too far, if any."""
         before = [ns for ns in self._framesets if self._shortest_ns <= stamp_ns - ns < _LONGEST_NS][-1:]
         after = [ns for ns in self._framesets if self._shortest_ns <= ns - stamp_ns < _LONGEST_NS][:1]
         return before + after
@@ -101,7 +105,7 @@ class MeasuredReadouts:
         return np.asarray(se3_inverse(here.origin_T_body) @ there.origin_T_body)
 
     def _acceleration(self, there_ns: int, here_ns: int) -> Float:
-        """Return the acceleration (3,) at one frameset, in body at another; that of the other if it is not known."""
+        """Return the acceleration (3,) at ``there_ns``, in body at ``here_ns``; if unknown, that at ``here_ns``."""
         by_imu = self._framesets[there_ns].by_imu
         if by_imu is None:
             by_imu = self._framesets[here_ns].by_imu

@@ -1,4 +1,4 @@
-"""Tracks of single cameras in other cameras whose views overlap, at the same instant: their distance in metres."""
+"""Matching of single cameras' tracks in other cameras with overlapping views, which gives their depth in metres."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from graphvio.measurements.motion import CrossCameraMatches
 from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, axes_angle_deg, overlap
 
 MIN_OVERLAP = 0.1
-"""Smallest share of an image that is searched for in another camera's."""
+"""Smallest share of a camera's image that another camera has to see, too, for its tracks to be searched for there."""
 
 
-_MAX_HANDOVER_OVERLAP = 0.4  # of what a camera shares with any other one
+_MAX_HANDOVER_OVERLAP = 0.4  # with any other camera, up to which a camera's tracks are handed over
 _MAX_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class _TwoCameras:
-    """Two cameras that see the same: near each other like a stereo pair, or looking different ways."""
+    """Two cameras with overlapping views: side by side like a stereo pair, or pointing in different directions."""
 
     left: Camera
     right: Camera
@@ -41,7 +41,7 @@ class _TwoCameras:
 
 @dataclass(eq=False)
 class _Partner:
-    """A camera in which tracks of another one are found, and what was found there last."""
+    """A camera in which tracks of another one are matched, and the last matches."""
 
     camera: int
     cameras: TwoCameras  # of which the left one has the tracks
@@ -52,13 +52,13 @@ class _Partner:
 class Overlaps:
     """Finds the tracks of each single camera in the other cameras that see the same part of the scene.
 
-    A track that was found before is found again near where its distance and the predicted motion put it; others are
-    searched for along their epipolar lines, by patches that are warped where the cameras look different ways. Rolling
-    shutters are left out: their lines are of different instants.
+    A track that was matched before is searched for near the place that its depth and the predicted motion give; others
+    are searched for along their epipolar lines. Patches are warped where the cameras point in different directions.
+    Rolling shutters are left out: their lines are exposed at different instants.
 
     Args:
-        rig: single cameras.
-        config: of all stages.
+        rig: the rig, of single cameras.
+        config: configuration of all stages.
     """
 
     def __init__(self, rig: Rig, config: Config) -> None:
@@ -72,7 +72,7 @@ class Overlaps:
         self._hands_over = [each < _MAX_HANDOVER_OVERLAP for each in shared]
 
     def recalibrate(self, rig: Rig, epipolar_margin_px: float) -> None:
-        """Search by another calibration of the same cameras from now on, whose epipolar lines may be off by so much."""
+        """Use another calibration of the same cameras from now on, whose epipolar lines may be off by a margin."""
         cameras = [single.left for single in rig.singles]
         for own, partners in zip(cameras, self._partners, strict=True):
             for partner in partners:
@@ -87,13 +87,13 @@ class Overlaps:
         searches: bool,
         wanted: Bool | None = None,
     ) -> None:
-        """Find the tracks of one camera in the others; those that were found at this instant before stay so.
+        """Find the tracks of one camera in the others; matches that were found earlier for this instant are kept.
 
         Args:
             camera: index of the camera.
-            views: of all cameras that have an image at this instant.
-            cam_T_before: returns the camera's predicted motion of points (4, 4) since a stamp, None where unknown.
-            searches: whether tracks that were not found before are searched for.
+            views: images and tracks of all cameras that have an image at this instant.
+            cam_T_before: returns the predicted motion (4, 4) of points in the camera since a stamp, None where unknown.
+            searches: whether tracks without an earlier match are searched for.
             wanted: (N,) which tracks to find, None for all.
         """
         own = views[camera]
@@ -102,7 +102,7 @@ class Overlaps:
                 self._find(partner, own, views[partner.camera], cam_T_before, searches, wanted)
 
     def matches_of(self, camera: int, frame: TrackedFrame) -> tuple[CrossCameraMatches, ...]:
-        """Return where other cameras see the tracks of a camera's newest frame, by the lenses of the rig file."""
+        """Return the matches of a camera's newest frame in other cameras, as rays by the lenses of the rig file."""
         found = []
         for partner in self._partners[camera]:
             if partner.found.stamp_ns == frame.stamp_ns:
@@ -113,16 +113,16 @@ class Overlaps:
         return tuple(found)
 
     def found_in(self, camera: int, stamp_ns: int, leaving: Mapping[int, Leaving]) -> list[FoundThere]:
-        """Return where a camera's image shows tracks that leave the other cameras' views.
+        """Return where a camera's image shows tracks that are about to leave other cameras' views.
 
-        Left out is what is found at another distance than the motion of its own camera shows, and the tracks of cameras
-        that share much of their view with another one, whose own tracks show the same: the error of the match then
-        outweighs what a longer track gains.
+        Matches are left out if their depth contradicts the depth by the motion of the track's own camera. So are tracks
+        of cameras that share much of their view with another one, which has own tracks there: the error of the match
+        would then outweigh the gain by a longer track.
 
         Args:
             camera: index of the camera.
-            stamp_ns: of its image.
-            leaving: camera -> its tracks.
+            stamp_ns: stamp of its image.
+            leaving: camera index -> its leaving tracks.
         """
         found = []
         for own, partners in enumerate(self._partners):
@@ -141,7 +141,7 @@ class Overlaps:
         return found
 
     def slant(self, camera: int, tracker: GroupTracker) -> None:
-        """Give a camera's tracker the depth of what was found last in the other cameras, and the slant where known."""
+        """Set depths, and slants where known, of a tracker's keyframe patches by the last matches in other cameras."""
         for is_slope_known in (False, True):
             for partner in self._partners[camera]:
                 if isinstance(partner.matcher, WarpedMatcher) is not is_slope_known:
@@ -181,7 +181,7 @@ class Overlaps:
 
 
 def _is_shared(own: Camera, other: Camera) -> bool:
-    """Whether tracks of a camera can be found in another one."""
+    """Return whether tracks of a camera can be found in another one."""
     if own is other or own.line_time_us or other.line_time_us or overlap(own, other) < MIN_OVERLAP:
         return False
     return bool(np.linalg.norm((other.cam_T_body @ own.body_T_cam)[:3, 3]) >= MIN_BASELINE_M)
@@ -195,7 +195,7 @@ def _partner(own: Camera, number: int, other: Camera, config: Config) -> _Partne
 
 
 def _agrees(there: TrackedFrame, leaving: Leaving, sigma_px: float) -> Bool:
-    """Select the matches (N,) of leaving tracks whose distance is that of their camera's own motion, within 3 sigma."""
+    """Select the matches (N,) of leaving tracks whose depth agrees, to 3 sigma, with that by their camera's motion."""
     if not len(leaving.ids):
         return np.zeros(len(there.ids), dtype=bool)
     rows = np.minimum(np.searchsorted(leaving.ids, there.ids), len(leaving.ids) - 1)
@@ -205,7 +205,7 @@ def _agrees(there: TrackedFrame, leaving: Leaving, sigma_px: float) -> Bool:
 
 
 def _expected(partner: _Partner, frame: TrackedFrame, motion: Float | None) -> tuple[Float, Float]:
-    """Return the inverse depths (N,), NaN where unknown, and slopes (N, 2) that tracks were last found with."""
+    """Return the tracks' inverse depths (N,), NaN where unknown, and slopes (N, 2), predicted from the last matches."""
     inverse_depths, slopes, before = np.full(len(frame.ids), np.nan), np.zeros((len(frame.ids), 2)), partner.found
     if not len(before.ids):
         return inverse_depths, slopes

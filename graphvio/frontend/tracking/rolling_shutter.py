@@ -1,7 +1,7 @@
-"""Compensation of rolling shutters: where points of an image were seen at its stamp, and where a line sees them.
+"""Compensation of rolling shutters: where points of an image would be at its stamp, and where its lines see them.
 
-Lines are exposed one after the other, the first at the image's stamp. Within the readout the rig is taken to turn and
-to move at accelerations that change linearly; a point's depth says how its pixel moves with that.
+Lines are exposed one after the other, the first at the image's stamp. Within the readout, the angular and the linear
+acceleration of the rig are taken to change linearly; a point's depth determines how its pixel moves with the rig.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from graphvio.rig import Camera, CameraGroup, SingleCamera
 
 _ROUNDS = 3  # a point's line depends on its pixel, and its pixel on the line
 _MIN_Z = 1e-3
-_MAX_POWER_OF_RATE = 2  # rates are fitted by parabolas: over a readout of 40 ms a turn that ends is not linear
-_MIN_SHARE_OF_LONGEST = 0.2  # of steps that count for that: between bursts of samples no parabola is known
+_MAX_POWER_OF_RATE = 2  # rates are fitted by parabolas: within a readout of 40 ms, the end of a turn is not linear
+_MIN_SHARE_OF_LONGEST = 0.2  # of IMU steps that support the fit: samples in bursts do not determine a parabola
 
 
 @dataclass(frozen=True, eq=False)
 class ReadoutMotion:
-    """How body moves while an image is read out: turn and way are polynomials of the time since the stamp.
+    """Motion of body while an image is read out: rotation and translation as polynomials of the time since the stamp.
 
     Attributes:
         angular_velocity: (3,) rad/s at the image's stamp, frame body.
@@ -35,10 +35,10 @@ class ReadoutMotion:
         acceleration: (3,) m/s^2 at the stamp, frame body at the stamp.
         angular_jerk: (3,) rad/s^3, frame body.
         jerk: (3,) m/s^3, frame body at the stamp.
-        force: (3,) m/s^2 what the accelerometer measures at the stamp, in body there: acceleration less gravity. Zero
-            where no IMU measures it.
-        velocity_covariance: (3, 3) of the velocity, (m/s)^2, or None where it is but a guess.
-        is_by_imu: Whether an IMU has measured turn and acceleration.
+        force: (3,) m/s^2 specific force, which the accelerometer measures, at the stamp, frame body at the stamp:
+            acceleration less gravity. Zero where no IMU measures it.
+        velocity_covariance: (3, 3) of the velocity, (m/s)^2, or None where the velocity is only a guess.
+        is_by_imu: Whether an IMU has measured rotation and acceleration.
     """
 
     angular_velocity: Float
@@ -53,7 +53,7 @@ class ReadoutMotion:
 
     @staticmethod
     def by_imu(interval: ImuInterval, gyro_bias: Float, accel_bias: Float) -> ReadoutMotion:
-        """Return what an IMU measures of a readout; velocity and acceleration are zero, until `falling` gives them."""
+        """Return the readout motion that an IMU measures, without velocity and acceleration, which `falling` adds."""
         rates = _fitted(interval.steps_s, interval.angular_velocity - gyro_bias, _MAX_POWER_OF_RATE)
         turning = ReadoutMotion(rates[0], np.zeros(3), rates[1], angular_jerk=2.0 * rates[2], is_by_imu=True)
         middles_s, measured = np.cumsum(interval.steps_s) - 0.5 * interval.steps_s, interval.linear_acceleration
@@ -63,12 +63,12 @@ class ReadoutMotion:
         return replace(turning, force=forces[0], jerk=forces[1])
 
     def falling(self, velocity: Float, gravity: Float) -> ReadoutMotion:
-        """Return the motion with a velocity (3,) m/s and gravity (3,) m/s^2 downwards, in body at the stamp."""
+        """Return the motion with a velocity (3,), m/s, and gravity (3,), m/s^2 downwards, both in body at the stamp."""
         return replace(self, velocity=velocity, acceleration=self.force + gravity)
 
     @staticmethod
     def steady(cur_T_prev: Float, seconds: float) -> ReadoutMotion:
-        """Return the motion that continues one of body (4, 4), of points, over some seconds."""
+        """Return the readout motion that continues the motion ``cur_T_prev`` (4, 4) of body over the seconds before."""
         prev_T_cur = se3_inverse(cur_T_prev)
         rate = so3_log(np.ascontiguousarray(prev_T_cur[:3, :3])) / seconds
         return ReadoutMotion(rate, prev_T_cur[:3, :3].T @ prev_T_cur[:3, 3] / seconds)
@@ -78,13 +78,13 @@ def pixels_at_stamp(camera: Camera, pixels: Float, inverse_depths: Float, motion
     """Return the pixels (N, 2) at which a global shutter would have seen points at the stamp, and their inverse depths.
 
     Args:
-        camera: with a rolling shutter.
+        camera: camera with a rolling shutter.
         pixels: (N, 2) as seen.
-        inverse_depths: (N,) 1/m, at their lines' instants.
-        motion: of body.
+        inverse_depths: (N,) 1/m, at the instants when the points' lines were exposed.
+        motion: motion of body during the readout.
 
     Returns:
-        Pixels (N, 2), as given where the point would have been out of view, and inverse depths (N,).
+        Pixels (N, 2), unchanged where the point would have been out of view, and inverse depths (N,).
     """
     rays, _ = camera.unproject(pixels)
     return _moved(
@@ -94,9 +94,10 @@ def pixels_at_stamp(camera: Camera, pixels: Float, inverse_depths: Float, motion
 
 
 def pixels_at_lines(camera: Camera, pixels: Float, inverse_depths: Float, motion: ReadoutMotion) -> tuple[Float, Float]:
-    """Return the pixels (N, 2) at which a rolling shutter sees points that it would see at the stamp at given ones.
+    """Return the pixels (N, 2) at which a rolling shutter sees points, given where it would see them at the stamp.
 
-    This is the inverse of `pixels_at_stamp`, with the inverse depths at the stamp.
+    This is the inverse of `pixels_at_stamp`: pixels and inverse depths are given at the stamp, and returned at the
+    instants when the points' lines are exposed.
     """
     rays, _ = camera.unproject(pixels)
     seen, depths = pixels, inverse_depths
@@ -109,14 +110,14 @@ def pixels_at_lines(camera: Camera, pixels: Float, inverse_depths: Float, motion
 
 
 def turned_rays(camera: Camera, pixels: Float, motion: ReadoutMotion) -> tuple[Float, Float]:
-    """Return the rays of pixels as if the camera had not turned since the stamp, and from where it has seen them.
+    """Return the rays of pixels as if the camera had not turned since the stamp, and the positions they are seen from.
 
-    The depth of a point is not needed for that: it says how its ray moves with the camera's place.
+    This does not need the depths of the points, which determine only how rays change with the camera's position.
 
     Args:
-        camera: with a rolling shutter.
+        camera: camera with a rolling shutter.
         pixels: (N, 2) as seen.
-        motion: of body.
+        motion: motion of body during the readout.
 
     Returns:
         Normalised coordinates (N, 2), and the rows (N, 4) of `graphvio.measurements.motion.CameraTracks.readout`.
@@ -127,10 +128,10 @@ def turned_rays(camera: Camera, pixels: Float, motion: ReadoutMotion) -> tuple[F
 
 
 def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) -> TrackedFrame:
-    """Return a frame whose points are as global shutters would have seen them at the stamp; pixels stay.
+    """Return a frame with rays and points as global shutters would have seen them at the stamp; its pixels stay.
 
-    The cameras of a pair have seen a point at nearly one instant, so that its depth is known before. A frame may be
-    compensated again, by another motion; the depths of single cameras then stay those of the first time.
+    The cameras of a pair see a point at nearly the same instant, so that its depth is known before the compensation.
+    A frame may be compensated again, by another motion; the depths of single cameras then stay those of the first time.
     """
     was_at_stamp = bool(frame.shutter_px.any())
     if was_at_stamp:  # back to where the lines have seen the points
@@ -151,15 +152,18 @@ def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) 
 
 
 def _columns(motion: ReadoutMotion) -> tuple[Float, Float]:
-    """Return turn and shift as polynomials of time, (3, 3) each: the coefficients of time and its powers."""
+    """Return rotation and translation as polynomials of time, (3, 3) each: rows are the coefficients of t, t^2, t^3."""
     turns = np.array([motion.angular_velocity, 0.5 * motion.angular_acceleration, motion.angular_jerk / 6.0])
     return turns, np.array([motion.velocity, 0.5 * motion.acceleration, motion.jerk / 6.0])
 
 
 def _fitted(steps_s: Float, means: Float, max_power: int) -> Float:
-    """Fit a polynomial of time to its means (N, 3) over steps: coefficients (max_power + 1, 3), the constant one first.
+    """Fit a polynomial of time whose means (N, 3) over N steps are given.
 
     Where there are few steps, or most of them are short, the coefficients of the highest powers are zero.
+
+    Returns:
+        Coefficients (max_power + 1, 3), the constant one first.
     """
     counted = int((steps_s >= _MIN_SHARE_OF_LONGEST * steps_s.max()).sum())
     ends, n = np.cumsum(steps_s), min(max_power + 1, counted)
@@ -172,14 +176,14 @@ def _fitted(steps_s: Float, means: Float, max_power: int) -> Float:
 
 @kernel
 def _turn_and_way(t: float, turns: Float, shifts: Float, lever: Float) -> tuple[Float, Float]:
-    """Return how body turns (3, 3) until a time after the stamp, and the way (3,) of a camera at a lever in body."""
+    """Return the rotation (3, 3) of body from the stamp to a time, and the displacement (3,) of a point at a lever."""
     turn = so3_exp(t * turns[0] + t * t * turns[1] + t * t * t * turns[2])
     return turn, t * shifts[0] + t * t * shifts[1] + t * t * t * shifts[2] + turn @ lever - lever
 
 
 @kernel
 def _turned(rays: Float, times_s: Float, turns: Float, shifts: Float, body_T_cam: Float) -> tuple[Float, Float]:
-    """Turn rays (N, 2) back from times (N,) to the stamp; beside them these times, and the camera's way."""
+    """Rotate rays (N, 2) back from times (N,) to the stamp; return them, and (N, 4) times and camera displacements."""
     turned, readout = rays.copy(), np.zeros((len(rays), 4))
     body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()
     for i in range(len(rays)):
@@ -196,7 +200,7 @@ def _moved(
     pixels: Float, rays: Float, inverse_depths: Float, times_s: Float, turns: Float, shifts: Float, to_lines: bool,
     body_T_cam: Float, model: int, intrinsics: Float, distortion: Float,
 ) -> tuple[Float, Float]:  # fmt: skip
-    """Move points between the stamp and times (N,) after it: pixels (N, 2) and inverse depths (N,)."""
+    """Move points from times (N,) to the stamp, or ``to_lines``, back: pixels (N, 2) and inverse depths (N,)."""
     moved, depths = pixels.copy(), inverse_depths.copy()
     limit = fold_radius(model, distortion)
     body_R_cam, lever = body_T_cam[:3, :3].copy(), body_T_cam[:3, 3].copy()

@@ -14,7 +14,7 @@ _T = THRESHOLDS.standstill
 
 
 class Standstill:
-    """Compares each pair's frames with the one since which it may have stood still."""
+    """Detects a standstill by comparing each pair's newest frame with the one at which it may have begun."""
 
     def __init__(self) -> None:
         self._since: dict[int, TrackedFrame] = {}

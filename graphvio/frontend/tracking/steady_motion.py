@@ -10,7 +10,7 @@ from graphvio.measurements.motion import RelativeMotion
 
 
 class SteadyMotion:
-    """Chain of measured motions, which predicts that the last one is repeated, as the odometry does without an IMU."""
+    """Chain of measured motions that predicts a repetition of the last one, as the odometry does without an IMU."""
 
     def __init__(self) -> None:
         self._nav_T_body: dict[int, Float] = {}
@@ -20,7 +20,7 @@ class SteadyMotion:
         self._nav_T_now = np.eye(4)
 
     def begin(self, stamp_ns: int) -> None:
-        """Predict the pose of a frameset."""
+        """Begin a step: predict the pose of a frameset."""
         self._now_ns = stamp_ns
         self._nav_T_now = np.eye(4) if self._latest_ns is None else self._nav_T_body[self._latest_ns] @ self._step
 

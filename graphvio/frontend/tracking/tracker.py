@@ -22,11 +22,11 @@ from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stam
 from graphvio.rig import CameraGroup, StereoPair
 from graphvio.timing import Stopwatch
 
-_MIN_FOUND = 0.7  # share of the tracks, below which the others are looked for where these foretell them
+_MIN_FOUND = 0.7  # share of the tracks, below which the others are searched for where the found ones predict them
 _MAX_ROUNDS = 3
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FRAMES_WITHOUT_DEPTH = 3  # then the track is dropped for another corner of its cell
-_LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks that fail are tried again with all
+_LEVELS_AFTER_PREDICTION = 2  # these suffice where the motion is predicted; tracks that fail are tried again with all
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +35,8 @@ class TrackedImage:
 
     Attributes:
         frame: the tracks.
-        pyramid: of the image, of two levels at least.
-        allowed: (height, width) where it may be used.
+        pyramid: pyramid of the image, of two levels at least.
+        allowed: (height, width) where the image may be used.
         min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
     """
 
@@ -50,10 +50,10 @@ class GroupTracker:
     """Tracker of the corners of one stereo pair, or of a single camera, from frame to frame.
 
     Args:
-        group: the cameras.
-        config: of all stages.
-        history: motions since the latest keyframes, by which a single camera's points are located.
-        image_mask: masks of each image, or None.
+        group: the stereo pair or single camera.
+        config: configuration of all stages.
+        history: motions since the latest keyframes, from which the depths of a single camera's points are computed.
+        image_mask: function that makes a mask for each image, or None.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class GroupTracker:
         self._config = config
         self._cell_px = config.corners.cell_px(group.left.size_px[0])
         self._usable = [UsablePixels(camera, config.tracking.window_px, image_mask) for camera in group.cameras]
-        self._allowed = self._usable[0].always  # and what of the newest image is not masked
+        self._allowed = self._usable[0].always  # later without the newest image's masks
         self._matcher = None
         if isinstance(group, StereoPair):
             self._matcher = StereoMatcher(group, config, self._usable[1].always)
@@ -95,12 +95,12 @@ class GroupTracker:
         """Follow the tracks, match them left to right and triangulate; replenish them where few are left.
 
         Args:
-            stamp_ns: of these images.
-            left: (height, width), contiguous, of the rig's image size; or the image of a single camera.
-            right: likewise, None of a single camera.
+            stamp_ns: stamp of these images.
+            left: left image (height, width), contiguous, of the rig's image size; or the image of a single camera.
+            right: right image likewise, None for a single camera.
             left_T_left_prev: (4, 4) predicted motion of points since the previous images, or None if unknown.
             left_T_left_keyframe: (4, 4) the same since the keyframe of `keep_keyframe_patches`, or None.
-            masks: of each image, (height, width), whose zeros are not used, or None.
+            masks: a mask (height, width) for each image, whose zeros are not used, or None.
             readout: motion of body while rolling shutters read the images out, or None if unknown.
         """
         watch = Stopwatch()
@@ -134,7 +134,10 @@ class GroupTracker:
         return self.replenish() if self._share_of_cells(self._last) < self._config.corners.scarce_share else self._last
 
     def replenish(self) -> TrackedFrame:
-        """Add new corners to the newest frame, where no track constrains translation."""
+        """Add new corners to the newest frame where no track constrains translation.
+
+        At a keyframe of a single camera, compute the points of its tracks from the motion history.
+        """
         watch = Stopwatch()
         pixels = self._new_corners(self._last)
         watch.lap("corners")
@@ -150,14 +153,14 @@ class GroupTracker:
         return self._last
 
     def adopt(self, pixels: Float, inverse_depths: Float) -> tuple[TrackedFrame, Int]:
-        """Follow points of the newest image from now on, where a single camera has no track near.
+        """Begin tracks at given points of a single camera's newest image, where it has no track near.
 
         Args:
-            pixels: (N, 2).
+            pixels: (N, 2) of the points.
             inverse_depths: (N,) of the points, 1/m.
 
         Returns:
-            All tracks, and which of the points (M,) the last M of them follow.
+            All tracks, and the indices (M,) of the points that the last M of them follow.
         """
         frame, cell_px = self._last, self._cell_px
         inside, usable = usable_at(pixels, self._allowed, self._config.corners.border_px)
@@ -174,7 +177,7 @@ class GroupTracker:
         return self._last, which[new.ids - first_id]
 
     def are_also_at(self, keyframe_ns: int, ids: Int, left_T_left_keyframe: Float) -> Bool:
-        """Return which tracks (N,) of the newest frame are seen where a motion since the keyframe has them, too.
+        """Return which tracks (N,) of the newest frame are also seen where a motion since the keyframe predicts them.
 
         Args:
             keyframe_ns: stamp of the keyframe.
@@ -196,15 +199,15 @@ class GroupTracker:
 
     @property
     def are_lines_off(self) -> bool:
-        """Whether corners are found beside the epipolar lines of the calibration."""
+        """Whether corners are matched on lines beside the epipolar lines of the calibration."""
         return self._matcher is not None and self._matcher.are_lines_off
 
     def move(self, body_T_left: Float) -> None:
-        """Take another pose (4, 4) of a single camera from now on."""
+        """Use another pose (4, 4) of a single camera in body from now on."""
         self._body_T_left = np.ascontiguousarray(body_T_left)
 
     def recalibrate(self, group: CameraGroup, epipolar_margin_px: float) -> None:
-        """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
+        """Use another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         if self._matcher is None:
             self._first_sights.recalibrate(self._group.left, group.left)
         elif isinstance(group, StereoPair):
@@ -214,7 +217,7 @@ class GroupTracker:
         self._last = self._last.recalibrated(group)
 
     def limit_corners(self, share: float) -> None:
-        """Use only a share of the image's cells, and so of the corners, from now on."""
+        """Enlarge the image's cells, so that there is only a share of the configured number of them and of corners."""
         self._cell_px = round(self._config.corners.cell_px(self._group.left.size_px[0]) / np.sqrt(share))
 
     def keep_keyframe_patches(self) -> None:
@@ -223,7 +226,7 @@ class GroupTracker:
             self._patches.take(self._last, self._left_pyramid[0], self._left_T_left_keyframe)
 
     def slant_keyframe_patches(self, found: TrackedFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
-        """Take depth and slant of the patches as another camera sees them, see `KeyframePatches.slant`."""
+        """Set depth and slant of the patches by matches in another camera, see `KeyframePatches.slant`."""
         self._patches.slant(found, cameras, is_slope_known)
 
     def drop(self, ids: Int) -> None:
@@ -234,9 +237,11 @@ class GroupTracker:
             self._last = self._last.keep(stays)
 
     def _predict(self, left_T_left_prev: Float | None) -> tuple[TrackedFrame, Float, Float, Bool]:
-        """Select the tracks to follow, and predict their pixels (N, 2) and inverse depths (N,), NaN if unknown.
+        """Select the tracks to follow, and predict where they are in the newest image.
 
-        The last of what is returned is whether each will still be in the image (N,).
+        Returns:
+            The tracks, their predicted pixels (N, 2) and inverse depths (N,), NaN if unknown, and whether each is
+            predicted to be in the image (N,).
         """
         last, camera = self._last.keep(self._last.frames_without_depth <= _MAX_FRAMES_WITHOUT_DEPTH), self._group.left
         if left_T_left_prev is None:
@@ -264,8 +269,8 @@ class GroupTracker:
     ) -> tuple[Float, Bool]:
         """Find the tracks' pixels now (N, 2), and which of them were found (N,).
 
-        Most are found on the keyframe's patches directly, near their predicted place; the others by way of the previous
-        frame.
+        Most are found directly by their patches in the keyframe, near their predicted place; the others are tracked
+        from the previous frame.
         """
         pixels, found = guess.copy(), np.zeros(len(guess), dtype=bool)
         if left_T_left_keyframe is not None and left_T_left_prev is not None:
@@ -273,7 +278,7 @@ class GroupTracker:
                 last.ids, guess, self._left_pyramid[0], left_T_left_keyframe, self._min_gradient
             )
         watch.lap("register")
-        # What leaves the image is not looked for: next to its edge something similar would be found instead.
+        # Tracks that leave the image are not searched for: next to its edge something similar would be found instead.
         others = np.flatnonzero(~found & is_in_view)
         if len(others):
             is_near = left_T_left_prev is not None
@@ -291,7 +296,7 @@ class GroupTracker:
         return pixels, found
 
     def _follow_again(self, before: Pyramid, last: TrackedFrame, pixels: Float, found: Bool) -> tuple[Float, Bool]:
-        """Look for lost tracks where those that were found foretell them, or else where the whole image has moved."""
+        """Search for lost tracks where the motion of the found ones, or else the shift of the image, predicts them."""
         camera = self._group.left
         w = _inverse_depths(last)
         for _ in range(_MAX_ROUNDS):
@@ -311,7 +316,7 @@ class GroupTracker:
         return pixels, found
 
     def _tracked(self, before: Pyramid, then: Float, guess: Float, is_near: bool) -> tuple[Float, Bool]:
-        """Track pixels (N, 2) of the previous image, from a guess that may be near."""
+        """Track pixels (N, 2) of the previous image from a guess; if it is near, with few pyramid levels first."""
         settings = self._config.tracking
         return track(
             before,
@@ -336,7 +341,7 @@ class GroupTracker:
         return passes(found, alone, "crowded", rejected)
 
     def _start_tracks(self, pixels: Float, inverse_depths: Float) -> TrackedFrame:
-        """Return new tracks of the newest image at pixels (N, 2), without those that the lens cannot have seen."""
+        """Return new tracks at pixels (N, 2) of the newest image, except those outside the domain of the lens."""
         n = len(pixels)
         ids, ages = self._next_id + np.arange(n), np.zeros(n, dtype=np.int64)
         self._next_id += n
@@ -349,7 +354,10 @@ class GroupTracker:
         self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float,
         frames_without_depth: Int, rejected: dict[str, int],
     ) -> TrackedFrame:  # fmt: skip
-        """Match tracks of the newest left image to the right one, and triangulate them."""
+        """Match tracks of the newest left image to the right one, and triangulate them.
+
+        Tracks of a single camera get the inverse depths that are given, or a prior.
+        """
         rays, has_ray = self._group.left.unproject(pixels)
         if self._matcher is None:
             frame = _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
@@ -376,14 +384,14 @@ class GroupTracker:
         return frame if self._readout is None else as_at_stamp(frame, self._group, self._readout)
 
     def read_out(self, readout: ReadoutMotion) -> TrackedFrame:
-        """Compensate rolling shutters of the newest frame by another motion of body than it was followed by."""
+        """Compensate the rolling shutters of the newest frame again, by another motion of body."""
         if self._group.left.line_time_us:
             self._readout, self._last = readout, as_at_stamp(self._last, self._group, readout)
         return self._last
 
     @property
     def _min_gradient(self) -> float:
-        """Smallest rms gradient along a patch's weaker direction; for pure noise it is 0.7 of the noise's deviation."""
+        """Smallest rms gradient along a patch's weaker direction; that of pure noise is 0.7 of its own sigma."""
         return min(MIN_GRADIENT, self._noise.left_sigma)
 
     def _share_of_cells(self, frame: TrackedFrame, new: Float | None = None) -> float:
@@ -394,11 +402,11 @@ class GroupTracker:
         return float(occupied_cells(both, cell_px, -(-height // cell_px), -(-width // cell_px)).mean())
 
     def _new_corners(self, frame: TrackedFrame) -> Float:
-        """Find corners (M, 2) where no track of a frame constrains translation, weak ones too where there are few."""
+        """Find corners (M, 2) where no track constrains translation, and also weak ones if corners are scarce."""
         settings, image = self._config.corners, self._left_pyramid[0]
         tracked, occupying = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
         if frame.is_single:
-            occupying = np.ones(len(tracked), dtype=bool)  # what is not near yet may turn out to be
+            occupying = np.ones(len(tracked), dtype=bool)  # a point that does not seem near may turn out to be
         cell_px, border_px = self._cell_px, settings.border_px
         new = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise.left_sigma
@@ -417,7 +425,7 @@ def _inverse_depths(frame: TrackedFrame) -> Float:
 def _unmatched(
     stamp_ns: int, ids: Int, ages: Int, pixels: Float, rays: Float, inverse_depths: Float, rejected: dict[str, int]
 ) -> TrackedFrame:
-    """Return the tracks of a single camera, with the inverse depths (N,) that are expected where they are known."""
+    """Return the tracks of a single camera, with the expected inverse depths (N,), or a prior where these are NaN."""
     n = len(ids)
     filled = np.where(np.isfinite(inverse_depths), inverse_depths, PRIOR_INVERSE_DEPTH)
     nothing, unmoved = np.zeros((n, 2)), np.zeros(n, dtype=np.int64)

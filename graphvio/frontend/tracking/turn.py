@@ -1,4 +1,4 @@
-"""How a single camera turns between two images, by its tracks alone: neither scale nor an IMU is needed for that."""
+"""Rotation of a single camera between two images, measured by its tracks alone, without scale and without an IMU."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from graphvio.measurements.motion import CameraTracks
 from graphvio.rig import Rig
 
 _MIN_TRACKS = 30
-_MIN_FITTING = 0.5  # share of the tracks
-_MAX_SLOPE = 1.5  # of rays: those of wide lenses beyond have errors many times as large in the image plane
+_MIN_FITTING = 0.5  # share of the tracks that fit the essential matrix
+_MAX_SLOPE = 1.5  # of rays against the axis: beyond it, errors in the image plane are many times as large
 _MAX_OFF_PX = 0.5
 _CONFIDENCE = 0.999
 _MAX_OFF_PLANE_PX = 0.7
@@ -26,12 +26,13 @@ def turn_between(rig: Rig, then: Mapping[int, CameraTracks], now: Mapping[int, C
     """Measure the rotation ``then_R_now`` (3, 3) of body by the essential matrix of the camera with most tracks.
 
     Args:
-        rig: Of single cameras.
-        then: What cameras saw at an instant, by their index.
-        now: What they saw some tenths of a second later.
+        rig: The rig, of single cameras.
+        then: Tracks of the cameras at an instant, by camera index.
+        now: The same some tenths of a second later.
 
     Returns:
-        None where no camera has enough tracks in common that move as one.
+        The rotation, or None if too few tracks are common to both instants or fit one motion, or if nearly all of them
+        lie on a plane.
     """
     tracks = {j: _tracks(then[j], now[j]) for j in then.keys() & now.keys()}
     if not tracks:
@@ -52,7 +53,7 @@ def turn_between(rig: Rig, then: Mapping[int, CameraTracks], now: Mapping[int, C
     )
     if np.count_nonzero(in_plane) > _MAX_IN_PLANE * fitting:
         return None
-    # Of the two rotations that explain it, one has half a turn more.
+    # Of the two rotations that fit the essential matrix, one has half a turn more.
     rotations = [np.ascontiguousarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(essential)[:2]]
     now_R_then = min(rotations, key=lambda rotation: float(np.linalg.norm(so3_log(rotation))))
     body_R_cam = rig.cameras[camera].body_T_cam[:3, :3]
@@ -60,7 +61,7 @@ def turn_between(rig: Rig, then: Mapping[int, CameraTracks], now: Mapping[int, C
 
 
 def _tracks(then: CameraTracks, now: CameraTracks) -> tuple[Float, Float]:
-    """Return the rays (N, 2) and (N, 2) of the tracks that both have."""
+    """Return the rays then and now, (N, 2) each, of the tracks that are common to both and near the axis."""
     first, second = common_rows(then.ids, now.ids)
     before, after = then.rays[first], now.rays[second]
     is_near_axis = (np.hypot(*before.T) < _MAX_SLOPE) & (np.hypot(*after.T) < _MAX_SLOPE)

@@ -1,1 +1,1 @@
-"""IMUs that are not part of a camera."""
+"""Readers of IMUs that are not part of a camera."""

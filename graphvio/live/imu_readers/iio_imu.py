@@ -1,4 +1,4 @@
-"""IMUs of Linux' Industrial I/O (IIO), by their files in sysfs and the buffers of their character devices."""
+"""Reader of IMUs of Linux' Industrial I/O (IIO), by their files in sysfs and the buffers of character devices."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ _MAX_SILENCE_NS = 3_000_000_000
 class IioImu:
     """Gyro and accelerometer of one IIO device, or of two whose samples are merged, as a `Device`.
 
-    Stamps are the kernel's, on the host's clock. Mount matrices are applied: they map to body.
+    Stamps are the kernel's, on the host's clock. Mount matrices are applied, so that samples are in body.
 
     Args:
-        names: of the devices, as in their files ``name``, or ``iio:deviceN``.
-        rate_hz: to set, or None to leave the rate.
+        names: names of the devices, as in their files ``name``, or ``iio:deviceN``.
+        rate_hz: the rate to set, or None to leave it as it is.
         sysfs: folder of all devices.
         dev: folder of the character devices.
     """
@@ -138,7 +138,7 @@ class _Buffer:
             self._write("buffer/enable", "0")
 
     def read_into(self, merging: AccelOntoGyro, arrival_ns: int) -> int:
-        """Pass on the scans in the buffer; returns their number."""
+        """Pass on the scans in the buffer to the merging; returns their number."""
         size = self._format.dtype.itemsize
         try:
             data = os.read(self._fd, _SCANS_A_READ * size)
@@ -251,13 +251,13 @@ def _find(sysfs: Path, name: str) -> Path:
 class ScanElement:
     """One channel of a scan; in sysfs ``[be|le]:[s|u]BITS/STORAGE[XREPEAT]>>SHIFT``."""
 
-    name: str  # such as ``in_anglvel_x``
-    index: int  # its order in the scan
-    is_signed: bool  # two's complement
+    name: str  # name of the channel, such as ``in_anglvel_x``
+    index: int  # its position in the scan
+    is_signed: bool  # whether it is in two's complement
     bits: int  # number of valid bits
-    storage_bytes: int  # its size, to a multiple of which it is aligned
-    shift: int  # to the right, before the valid bits are taken
-    is_big_endian: bool  # byte order
+    storage_bytes: int  # its size in the scan, to a multiple of which it is aligned
+    shift: int  # number of bits to shift right, before the valid bits are taken
+    is_big_endian: bool  # whether its byte order is big-endian
 
     @staticmethod
     def parse(name: str, index: str, kind: str) -> ScanElement:
@@ -286,7 +286,7 @@ class ScanFormat:
     """Layout of the enabled elements in a scan: each is aligned to its own size.
 
     Attributes:
-        dtype: of a whole scan, with a field for each element.
+        dtype: numpy type of a whole scan, with a field for each element.
     """
 
     def __init__(self, elements: list[ScanElement]) -> None:

@@ -1,4 +1,4 @@
-"""IMUs on a serial port, whose lines of text take a few lines of a microcontroller's code.
+"""Reader of IMUs on a serial port that send lines of text, which a few lines of microcontroller code can write.
 
     stamp_us,gx,gy,gz,ax,ay,az[,temperature][*HH]
 
@@ -37,7 +37,7 @@ class ImuLines:
 
     Args:
         clock: name of the microcontroller's clock.
-        counts: of ``bad_line``, ``bad_checksum`` and ``clock_restarted``.
+        counts: counts ``bad_line``, ``bad_checksum`` and ``clock_restarted``.
     """
 
     def __init__(self, clock: str, counts: Counts) -> None:
@@ -102,10 +102,10 @@ class ImuLines:
 
 
 class SerialImu:
-    """An IMU on a serial port as a `Device`, by pyserial.
+    """An IMU on a serial port as a `Device`, read with pyserial.
 
     Args:
-        path: of the port.
+        path: path of the port.
         baud: rate of the port.
 
     Raises:

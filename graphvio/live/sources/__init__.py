@@ -1,4 +1,4 @@
-"""Live sources: one module a kind, which lists its devices and opens a source."""
+"""Live sources: one module for each kind, which lists its devices and opens a source."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ KINDS = ("v4l2", "realsense", "oak", "ros2", "replay", "simulator")
 class SourceSpec:
     """``KIND[:WHAT][?KEY=VALUE[&KEY=VALUE]]``, such as ``realsense:0123,4567?rate_hz=30``; or a recording's path."""
 
-    kind: str  # of source, one of `KINDS`
+    kind: str  # kind of source, one of `KINDS`
     what: str = ""  # device, devices separated by commas, path or name; may be empty
-    options: Mapping[str, str] = field(default_factory=dict)  # of the source
+    options: Mapping[str, str] = field(default_factory=dict)  # options of the source: key -> value
 
     @staticmethod
     def parse(text: str) -> SourceSpec:
-        """Parse a text.
+        """Parse the text of a source on the command line.
 
         Raises:
-            SourceError: if there is no such kind, or an option has no value or two.
+            SourceError: if there is no such kind, or an option has no value or two values.
         """
         head, _, tail = text.partition("?")
         kind, _, what = head.partition(":")
@@ -49,7 +49,7 @@ class SourceSpec:
 
 
 def _unknown(text: str, kind: str) -> SourceError:
-    """Return the error of a text that begins with no kind and is no path."""
+    """Return the error for a text that neither begins with a kind nor is an existing path."""
     from graphvio.simulation import SCENE_NAMES
 
     absent = f"{text}: there is no live source {kind!r} and no recording at that path"
@@ -65,7 +65,7 @@ def _unknown(text: str, kind: str) -> SourceError:
 
 
 class SourceKind(Protocol):
-    """Interface of the modules."""
+    """Interface of the modules of this package, one for each kind of source."""
 
     def list_devices(self) -> Sequence[DeviceInfo]:
         """List the connected devices.
@@ -78,8 +78,8 @@ class SourceKind(Protocol):
         """Make a source; nothing is started before its `open`.
 
         Args:
-            spec: of the source.
-            rig: or None for the rig of the source itself.
+            spec: what to open, with its options.
+            rig: the rig to use, or None for the rig of the source itself.
 
         Raises:
             SourceError: if an option is not known, or its value is not valid.
@@ -88,7 +88,7 @@ class SourceKind(Protocol):
 
 
 def kind_of(name: str) -> SourceKind:
-    """Import the module of a kind."""
+    """Import and return the module of a kind."""
     return cast(SourceKind, import_module(f"graphvio.live.sources.{name}"))
 
 
@@ -99,10 +99,10 @@ def open_live_source(text: str, rig: Rig | None = None) -> LiveSource:
 
 
 def check_options(spec: SourceSpec, known: Sequence[str]) -> None:
-    """Check that a kind has the options of a spec.
+    """Check that all options of a spec are known to its kind.
 
     Raises:
-        SourceError: if not; the message names the nearest option.
+        SourceError: if one is not; the message names the nearest known option.
     """
     for key in spec.options:
         if key not in known:

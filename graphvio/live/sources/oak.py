@@ -1,4 +1,4 @@
-"""Luxonis OAK cameras with a stereo pair of grey cameras, such as OAK-D, by DepthAI 3."""
+"""Live source of Luxonis OAK cameras with a stereo pair of grey cameras, such as OAK-D, by DepthAI 3."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ class StreamSettings:
 
 
 class Connection(Protocol):
-    """A running camera: depthai's device and pipeline, or in tests queues of messages.
+    """Interface to a running camera: depthai's device and pipeline, or queues of messages in tests.
 
     Attributes:
-        calibration: `depthai.CalibrationHandler`.
+        calibration: `depthai.CalibrationHandler` with the factory's calibration.
         images: queues of `depthai.ImgFrame`, left and right.
         imu: queue of `depthai.IMUData`, or None.
         detail: model and connection, for people.
@@ -75,7 +75,7 @@ class Connection(Protocol):
     detail: str
 
     def is_alive(self) -> bool:
-        """Return whether it runs, as far as the library knows."""
+        """Return whether the camera runs, as far as the library knows."""
 
     def close(self) -> None:
         """Release the camera."""
@@ -160,7 +160,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, connect: Connect = DepthAiCon
 
 
 class OakDevice(StereoCamera):
-    """A camera as a `Device`."""
+    """An OAK camera as a `Device`."""
 
     def __init__(self, device_id: str, cameras: tuple[str, str], settings: StreamSettings, connect: Connect) -> None:
         super().__init__("oak", device_id, cameras)
@@ -181,7 +181,7 @@ class OakDevice(StereoCamera):
             ) from None
         self._detail = connection.detail
         self._calibrate(lambda: self._read_calibration(connection.calibration))
-        for side, queue in enumerate(connection.images):  # depthai's threads call; the queues themselves are not read
+        for side, queue in enumerate(connection.images):  # depthai's threads call; the queues are not read
             queue.addCallback(self._guarded(partial(self._on_image, side, hand_over), "bad_message"))
         if connection.imu is not None:
             connection.imu.addCallback(self._guarded(self._on_imu, "bad_message"))
@@ -240,10 +240,10 @@ def fitted_lens(calibration: Any, socket: Any, size_px: tuple[int, int], where: 
         calibration: `depthai.CalibrationHandler`.
         socket: `depthai.CameraBoardSocket`.
         size_px: (width, height); images of another aspect ratio than the sensor's are cropped, as the camera does.
-        where: for messages.
+        where: name of the camera, for messages.
 
     Raises:
-        RigError: if it is not calibrated, or no model of graphvio comes near.
+        RigError: if the camera is not calibrated, or none of graphvio's models is near enough.
     """
     matrix = _read(lambda: calibration.getCameraIntrinsics(socket, *size_px), where)
     coefficients = _read(lambda: calibration.getDistortionCoefficients(socket), where).ravel()
@@ -267,10 +267,10 @@ def factory_rig(
 
     Args:
         calibration: `depthai.CalibrationHandler`.
-        sockets: of the left and the right camera.
-        lenses: of both.
-        settings: of the streams; without an IMU, body is the left camera, else the IMU.
-        name: of the rig.
+        sockets: `depthai.CameraBoardSocket` of the left and the right camera.
+        lenses: lenses of both cameras.
+        settings: settings of the streams; body is the IMU if it is read, otherwise the left camera.
+        name: name of the rig.
 
     Raises:
         RigError: if the calibration is incomplete.
@@ -297,7 +297,7 @@ def factory_rig(
 
 
 def _transform(read: Callable[[], Any], where: str) -> Float:
-    """Read a transform (4, 4) in metres from one in centimetres."""
+    """Read a transform (4, 4) that is given in centimetres, and return it in metres."""
     transform = _read(read, where)
     transform[:3, 3] *= _M_PER_CM
     if not np.abs(transform[:3, :3]).max() > 0.0:  # an EEPROM that was never written
@@ -323,7 +323,7 @@ def _ns(since_boot: timedelta) -> int:
 
 
 def _library() -> Any:
-    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # else it warns where no camera is connected
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # otherwise it warns if no camera is connected
     with importing("depthai", "oak", "an OAK camera"):
         import depthai
     return depthai

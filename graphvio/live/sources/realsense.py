@@ -1,4 +1,4 @@
-"""Intel RealSense cameras of the D400 series: infrared stereo pairs with a global shutter, and their IMU."""
+"""Live source of Intel RealSense D400 cameras: infrared stereo pairs with a global shutter, and their IMU."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ACCEL_NOISE = 1.5e-3
 
 
 class Bus(Protocol):
-    """Where cameras are found: librealsense's context, or in tests software devices."""
+    """Interface to find cameras: librealsense's context, or software devices in tests."""
 
     def find(self, serial: str) -> Any | None:
         """Return the `pyrealsense2.device` with this serial number, if it is connected."""
@@ -50,7 +50,7 @@ class Bus(Protocol):
 
 
 class ContextBus:
-    """Cameras that librealsense finds."""
+    """A `Bus` of the cameras that librealsense finds."""
 
     def __init__(self) -> None:
         import pyrealsense2 as rs
@@ -65,7 +65,7 @@ class ContextBus:
         """Return all cameras by serial number."""
         found = {}
         for device in self._context.query_devices():
-            with suppress(RuntimeError):  # one that is being unplugged
+            with suppress(RuntimeError):  # raised for a device that is being unplugged
                 found[str(device.get_info(self._serial_number))] = device
         return found
 
@@ -138,7 +138,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, bus: Bus | None = None) -> Li
 
 
 class RealSenseDevice(StereoCamera):
-    """A camera as a `Device`."""
+    """A RealSense camera as a `Device`."""
 
     def __init__(self, serial: str, cameras: tuple[str, str], settings: StreamSettings, bus: Bus) -> None:
         super().__init__("realsense", serial, cameras)
@@ -189,7 +189,7 @@ class RealSenseDevice(StereoCamera):
         """See `Device.stop`."""
         while self._started:
             sensor = self._started.pop()
-            with suppress(RuntimeError):  # it may not have been started, or be gone
+            with suppress(RuntimeError):  # the sensor may not have been started, or be gone
                 sensor.stop()
             with suppress(RuntimeError):
                 sensor.close()
@@ -203,7 +203,7 @@ class RealSenseDevice(StereoCamera):
         return self._removed.is_set()
 
     def _sensor(self, device: Any, is_wanted: Callable[[Any], bool], what: str) -> tuple[Any, list[Any]]:
-        """Find the sensor that has two wanted streams, and their profiles."""
+        """Return the sensor that has two wanted streams, and their profiles."""
         for sensor in device.query_sensors():
             found: dict[tuple[Any, int], Any] = {}
             for profile in sorted(sensor.get_stream_profiles(), key=lambda profile: profile.fps()):
@@ -226,7 +226,7 @@ class RealSenseDevice(StereoCamera):
         import pyrealsense2 as rs
 
         settings = self._settings
-        _set(stereo, rs.option.emitter_enabled, 0)  # its dots move with the rig
+        _set(stereo, rs.option.emitter_enabled, 0)  # the dots of its pattern move with the rig
         _set(stereo, rs.option.global_time_enabled, 0)  # stamps by the device's own clock
         _set(stereo, rs.option.enable_auto_exposure, float(settings.exposure_us is None))
         if settings.exposure_us is not None:
@@ -265,7 +265,7 @@ class RealSenseDevice(StereoCamera):
             self._merging.add_accel(stamp_ns, vector)
 
     def _stamp(self, frame: Any, arrival_ns: int) -> tuple[int, str | None]:
-        """Return stamp and clock: the device's, or the host's where the system does not provide the device's."""
+        """Return stamp and clock: the device's, or the host's (None) where the system provides no device stamps."""
         import pyrealsense2 as rs
 
         stamp_ms = frame.get_timestamp()
@@ -288,11 +288,11 @@ def factory_rig(left: Any, right: Any, gyro: Any | None, imu_rate_hz: float, nam
         left: `pyrealsense2.stream_profile` of infrared 1.
         right: profile of infrared 2.
         gyro: profile of the gyro, whose frame is body; None if there is no IMU, and body is the left camera.
-        imu_rate_hz: of the gyro.
-        name: of the rig.
+        imu_rate_hz: rate of the gyro.
+        name: name of the rig.
 
     Raises:
-        RigError: if graphvio does not have the model of a lens, or the calibration is incomplete.
+        RigError: if graphvio does not support the model of a lens, or the calibration is incomplete.
     """
     body_T_left = np.eye(4) if gyro is None else _transform(left, gyro, name)
     body_T_right = body_T_left @ se3_inverse(_transform(left, right, name))

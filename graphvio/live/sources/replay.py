@@ -1,4 +1,4 @@
-"""Recordings as a live source: in real time, at a multiple of it, or as fast as readings are taken."""
+"""Replay of recordings as a live source: in real time, at a multiple of it, or as fast as readings are taken."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_DELAY_NS = 1_000_000_000
 
 
 def list_devices() -> Sequence[DeviceInfo]:
-    """See `SourceKind.list_devices`: always one, any recording."""
+    """See `SourceKind.list_devices`: returns always one entry, which stands for any recording."""
     return [
         DeviceInfo("replay:RECORDING", "a recording in real time; ?speed=2 is twice as fast, ?speed=max waits for none")
     ]
@@ -44,7 +44,7 @@ class Replay:
     """A recording as a `LiveSource`.
 
     Args:
-        recording: is read once.
+        recording: the recording, which is read once.
         speed: factor of the recording's time, or None for as fast as readings are taken.
     """
 
@@ -55,7 +55,7 @@ class Replay:
         self._pace = Pace(speed)
 
     def open(self) -> Rig:
-        """Return the rig of the recording, as of images whose stamps are corrected already."""
+        """Return the rig of the recording without stamp offsets, as the images' stamps are corrected already."""
         return self._recording.rig.without_stamp_offsets()
 
     def readings(self) -> Iterator[Reading]:
@@ -74,7 +74,7 @@ class Replay:
 
 
 class Pace:
-    """Waits until measurements are due by a factor of the recording's time; with None it does not wait."""
+    """Waits until measurements are due, at a factor of the recording's speed; with None it does not wait."""
 
     def __init__(self, speed: float | None) -> None:
         self._speed = speed
@@ -88,14 +88,14 @@ class Pace:
                 self._first = stamp_ns, host_ns()
             due_ns = self._first[1] + round((stamp_ns - self._first[0]) / self._speed)
             left_ns = due_ns - host_ns()
-            if left_ns < -_MAX_DELAY_NS:  # after a suspension or a slow reader: sensors do not make up for that
+            if left_ns < -_MAX_DELAY_NS:  # after a suspension or a slow reader: real sensors do not catch up either
                 self._first = stamp_ns, host_ns()
             elif left_ns > 0:
                 self._stop.wait(left_ns * 1e-9)
         return not self._stop.is_set()
 
     def stop(self) -> None:
-        """End the current wait and all later ones; from any thread."""
+        """End the current wait and all later ones; may be called from any thread."""
         self._stop.set()
 
 
@@ -110,8 +110,8 @@ def paced(measurements: Iterable[Measurement], rig: Rig, pace: Pace) -> Iterator
     """Yield measurements as readings of one clock when they are due, those before the first frameset at once.
 
     Args:
-        measurements: of a recording.
-        rig: names the cameras.
+        measurements: the measurements of a recording.
+        rig: the rig, for the names of the cameras.
         pace: waits for the stamps, and ends the readings when it is stopped.
     """
     has_frameset = False

@@ -1,4 +1,4 @@
-"""Cameras and an IMU that publish on ROS 2, received over DDS; ROS need not be installed."""
+"""Live source of cameras and an IMU that publish on ROS 2, received over DDS; ROS need not be installed."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from graphvio.wording import listed
 _NODE: Final = "/graphvio_source"
 _OPTIONS: Final = ("domain", "imu", "body", "reliable", "wait_s")
 _WAIT_S: Final = 10.0
-_DISCOVERY_S: Final = 1.0  # without a new publication: discovery is complete
+_DISCOVERY_S: Final = 1.0  # time without a new publication after which discovery is complete
 _POLL_S: Final = 0.05
-_LIVENESS_S: Final = 0.2  # between checks of the publishers
+_LIVENESS_S: Final = 0.2  # time between checks of the publishers
 
 
 def list_devices() -> Sequence[DeviceInfo]:
@@ -74,8 +74,8 @@ class Ros2Source:
     """Topics of ROS 2 as a `LiveSource`; stamps are those of the messages, assumed to be of one clock.
 
     Args:
-        spec: see `open_source`.
-        rig: or None, to receive it from ``camera_info`` and ``tf_static``.
+        spec: the topics and options, see `open_source`.
+        rig: the rig, or None to receive it from ``camera_info`` and ``tf_static``.
     """
 
     is_realtime = True
@@ -96,11 +96,11 @@ class Ros2Source:
 
     @property
     def name(self) -> str:
-        """For people, and fit for the name of a file."""
+        """Name for people, which can also be used in file names."""
         return f"ros2-domain{self._domain}"
 
     def open(self) -> Rig:
-        """Find the topics, and listen to them.
+        """Find the topics and subscribe to them.
 
         Raises:
             SourceError: if a topic is not published.
@@ -163,11 +163,11 @@ class Ros2Source:
                 yield from filter(None, [each.poll() for each in topics])
 
     def health(self) -> Sequence[DeviceHealth]:
-        """Return the state of each topic; from any thread."""
+        """Return the state of each topic; may be called from any thread."""
         return [each.health for each in self._topics] or self._last_health
 
     def close(self) -> None:
-        """Leave the domain; from any thread."""
+        """Leave the domain; may be called from any thread."""
         self._closing.set()
         node, self._node = self._node, None
         if node is not None:
@@ -199,7 +199,7 @@ class Ros2Source:
         return published
 
     def _suffices(self, types: Mapping[str, str]) -> bool:
-        """Return whether each sensor has a topic; else its publisher may not have started yet."""
+        """Return whether each sensor has a topic; otherwise its publisher may not have started yet."""
         if self._rig is None:
             return bool(stereo_topics(_images(types)))
         try:

@@ -31,20 +31,20 @@ class Outage:
 
 @dataclass(frozen=True)
 class DeviceFaults:
-    """Faults of a rig's devices: each pair is one, and the IMU is one."""
+    """Faults of a rig's devices, which are the pairs, the single cameras and the IMU."""
 
-    # of the first device's clock; those of the others are smaller, of alternating sign. None gives all devices one
-    # clock.
+    # drift of the first device's clock; those of the others are at most as large, of alternating sign. With None, all
+    # devices share one clock
     drift_ppm: float | None = None
     jitter_ms: float = 0.0  # mean of the exponentially distributed delay of a reading on its way to the host
-    outages: tuple[Outage, ...] = ()  # of the devices
+    outages: tuple[Outage, ...] = ()  # intervals in which devices are unplugged
 
     @staticmethod
     def parse(options: Mapping[str, str], rig_devices: tuple[str, ...]) -> DeviceFaults:
         """Parse options such as ``drift_ppm=100``, ``jitter_ms=2`` and ``unplug=back@5-8,imu@20-21``.
 
         Raises:
-            SourceError: if a device is not there, or a value is not valid.
+            SourceError: if the rig does not have a device, or a value is not valid.
         """
         try:
             drift = float(options["drift_ppm"]) if "drift_ppm" in options else None
@@ -78,7 +78,7 @@ def devices_of(rig: Rig) -> tuple[str, ...]:
 def with_faults(
     readings: Iterable[Reading], rig: Rig, faults: DeviceFaults, start_ns: int, seed: int
 ) -> Iterator[Reading]:
-    """Apply faults to readings of one clock, whose outages count from the stamp ``start_ns``."""
+    """Apply faults to readings of one clock; the times of outages count from the stamp ``start_ns``."""
     devices = devices_of(rig)
     device_of = {camera.name: group.name for group in rig.groups for camera in group.cameras}
     rng, number = np.random.default_rng(seed), count()

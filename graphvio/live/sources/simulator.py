@@ -1,7 +1,7 @@
-"""The simulator as a live source: a walk that is rendered once, by another process, and then walked there and back.
+"""The simulator as a live source: a walk that is rendered once, by another process, and then replayed there and back.
 
-On the way back time runs backwards: positions and attitudes are those of the way there, velocities and rates have the
-other sign, accelerations are the same. Where a walk begins and ends stationary, the whole motion is smooth.
+On the way back, time runs backwards: positions and attitudes are those of the way there, velocities and rates have the
+opposite sign, accelerations are the same. If a walk begins and ends stationary, the whole motion is smooth.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ _log = logging.getLogger(__name__)
 
 
 def list_devices() -> Sequence[DeviceInfo]:
-    """See `SourceKind.list_devices`: scenes that end stationary, which can be walked without end."""
+    """See `SourceKind.list_devices`: lists the scenes that end stationary, whose walk can be repeated without end."""
     return [DeviceInfo(f"simulator:{name}", f"simulated rig, scene {name}") for name in ("room", "loop")]
 
 
 def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
-    """Make a source of a scene by its name, ``room`` by default; see `SourceKind.open_source`."""
+    """Make a source of the scene that the spec names, ``room`` by default; see `SourceKind.open_source`."""
     check_options(spec, _OPTIONS)
     scene = spec.what or "room"
     if scene not in SCENE_NAMES:
@@ -77,19 +77,19 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
 
 
 class SimulatedRig:
-    """A scene as a `LiveSource`.
+    """A simulated scene as a `LiveSource`.
 
     Args:
-        scene: its name.
-        rig: replaces the scene's own, such as one with fewer pairs, or None.
+        scene: name of the scene.
+        rig: a rig that replaces the scene's own, such as one with fewer pairs, or None.
         speed: factor of the scene's time, or None for as fast as readings are taken.
-        duration_s: of the readings; None for no end.
+        duration_s: duration of the readings; None for no end.
         legs: number of walks, there and back counting as two; None for no end.
-        seed: of all noise.
+        seed: seed of all noise.
         rate_hz: framesets per second; None for the scene's own rate.
-        recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders it once, as much as
-            the duration takes, into graphvio's folder of the user's cache.
-        rig_name: of the rig that is rendered; None for the scene's own.
+        recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders the scene once, as
+            much of it as the duration takes, into graphvio's folder of the user's cache.
+        rig_name: name of the rig to render; None for the scene's own.
         faults: options of `DeviceFaults.parse`.
     """
 
@@ -129,7 +129,7 @@ class SimulatedRig:
         """Render the scene, which takes minutes, unless it is in the cache, and open the recording.
 
         Raises:
-            SourceError: if it cannot be rendered or walked back, or a fault is not valid.
+            SourceError: if the scene cannot be rendered or walked back, or a fault is not valid.
         """
         folder = self._folder if self._folder is not None else self._rendered()
         self._opened = open_recording(folder, self._rig)
@@ -145,7 +145,7 @@ class SimulatedRig:
             yield from with_faults(readings, self._opened.rig, self._faults, self._opened.start_ns, self._seed)
 
     def health(self) -> Sequence[DeviceHealth]:
-        """Return that it is connected, as always."""
+        """Return the state of the simulated device, which is always connected."""
         return [DeviceHealth(self.name, True, "simulated")]
 
     def close(self) -> None:
@@ -162,7 +162,7 @@ class SimulatedRig:
             leg += 1
 
     def _inertial(self, recording: Source) -> ImuTrack | None:
-        """Simulate the IMU track with its biases, which a recording does not separate."""
+        """Simulate the IMU track with its biases, which cannot be separated in the recording."""
         from graphvio.simulation.simulator import make_simulator
 
         if recording.rig.imu is None:
@@ -186,14 +186,14 @@ class SimulatedRig:
         return self._duration_s is not None and self._duration_s * 1e9 <= recording.end_ns - recording.start_ns
 
     def _part_s(self) -> int | None:
-        """Return how many seconds of the walk are enough for the duration; None if it takes all of it."""
+        """Return how many seconds of the walk are enough for the duration; None if all of the walk is needed."""
         if self._duration_s is None:
             return None
         part_s = int(np.ceil(self._duration_s)) + 1
         return part_s if part_s < build_scene(self._scene).motion.duration_s else None
 
     def _rendered(self) -> Path:
-        """Return the folder of the rendered scene, after rendering it if need be, or as much of it as is asked for."""
+        """Return the folder of the rendered scene; render it, or as much of it as is needed, if it does not exist."""
         root, part_s = cache_root().parent / "simulator", self._part_s()
         rig = "" if self._is_own_rig else f"-{self._rig_name}"
         part = "" if part_s is None else f"-{part_s}s"
@@ -223,7 +223,7 @@ class SimulatedRig:
 
 
 def _leg(recording: Source, track: ImuTrack | None, leg: int) -> Iterator[Measurement]:
-    """Yield one walk, there if the leg is even, back if it is odd; measurements at the turn come once."""
+    """Yield the measurements of one walk: there if the leg is even, back if it is odd; those at the turn come once."""
     start_ns, end_ns = recording.start_ns, recording.end_ns
     shift_ns, is_back = leg * (end_ns - start_ns), bool(leg % 2)
     origin_ns = end_ns if is_back else start_ns

@@ -1,4 +1,4 @@
-"""Options of a live source as sizes, numbers, choices and names; a `SourceError` says what is wrong with a value."""
+"""Parsing of a live source's options as sizes, numbers, choices and names; a `SourceError` explains invalid values."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float, word: 
     """Return a number in a range, or None where it is not given.
 
     Args:
-        spec: of the source.
-        key: of the option.
+        spec: the source with its options.
+        key: name of the option.
         minimum: smallest value.
         maximum: largest value.
-        word: that the option takes besides numbers, and that the caller has looked for; only for the message.
+        word: a word that the option takes besides numbers, and that the caller has handled; only for the message.
 
     Raises:
-        SourceError: if it is no number, or outside the range.
+        SourceError: if the value is no number, or outside the range.
     """
     text = spec.options.get(key)
     if text is None:

@@ -1,4 +1,4 @@
-"""What stereo cameras with a factory calibration have in common: monitoring, opening, and the rig of one or several."""
+"""Common parts of stereo cameras with a factory calibration: monitoring, opening, and the rig of one or several."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _MAX_SILENCE_NS = 5_000_000_000
 
 
 class StereoCamera(ABC):
-    """Base of a `Device` whose library's threads hand readings over, while its own thread monitors them.
+    """Base class of a `Device` whose library's threads hand readings over, while its own thread monitors them.
 
     Args:
-        kind: of source.
-        device_id: of the camera, which is also the name of its clock.
+        kind: kind of source.
+        device_id: identifier of the camera, which is also the name of its clock.
         cameras: names of the left and the right camera in the rig.
     """
 
@@ -35,7 +35,7 @@ class StereoCamera(ABC):
         self.clock = device_id
         self._cameras = cameras
         self.counts = Counts()
-        self._numbers: dict[int, int] = {}  # of the newest image of each side
+        self._numbers: dict[int, int] = {}  # sequence number of the newest image of each side
         self._newest_ns = 0
         self._merging: AccelOntoGyro | None = None
         self._factory_rig: Rig | RigError = RigError(f"{self.name}: was not started")
@@ -53,7 +53,7 @@ class StereoCamera(ABC):
         """Return the factory's calibration of the camera, once it is started.
 
         Raises:
-            RigError: if that is no usable rig.
+            RigError: if the calibration is not usable as a rig.
         """
         if isinstance(self._factory_rig, RigError):
             raise self._factory_rig
@@ -87,7 +87,7 @@ class StereoCamera(ABC):
             self._factory_rig = error
 
     def _guarded(self, on_message: Callable[[Any], None], kind: str) -> Callable[[Any], None]:
-        """Count errors, as an exception in the library's thread would end the process."""
+        """Wrap a callback to count its errors, as an exception in the library's thread would end the process."""
 
         def guarded(message: Any) -> None:
             try:
@@ -103,12 +103,12 @@ class StereoCamera(ABC):
 
 
 def has_imu(spec: SourceSpec, rig: Rig | None) -> bool:
-    """Return whether the first camera's IMU is read, by the option ``imu`` and the rig."""
+    """Return whether the first camera's IMU is read, which depends on the option ``imu`` and the rig."""
     return choice_of(spec, "imu", ("first", "none")) == "first" and (rig is None or rig.imu is not None)
 
 
 def is_guessed(spec: SourceSpec) -> bool:
-    """Return whether the poses of cameras to each other may be guessed, by the option ``places``."""
+    """Return whether the relative poses of the cameras may be guessed, which the option ``places`` decides."""
     return choice_of(spec, "places", ("known", "guess")) == "guess"
 
 
@@ -122,8 +122,8 @@ def open_cameras(
     """Make the source of one or several cameras.
 
     Args:
-        spec: names the cameras; if it names none, one must be connected.
-        rig: or None for the factory's calibration.
+        spec: names the cameras; if it names none, exactly one must be connected.
+        rig: the rig, or None for the factory's calibration.
         size_px: (width, height) of the images.
         list_ids: returns the identifiers of all connected cameras.
         make: returns a camera by its identifier, the names of its cameras in the rig, and its index.
@@ -164,7 +164,7 @@ def _only_id(kind: str, ids: Sequence[str]) -> str:
 
 
 def _checked_rig(rig: Rig, size_px: tuple[int, int], is_imu_read: bool, kind: str) -> Rig:
-    """Check that a rig has images of the size that its cameras deliver; returns it, without the IMU if not read."""
+    """Check that a rig has images of the size that the cameras deliver; return it, without the IMU if not read."""
     for camera in rig.cameras:
         if camera.size_px != size_px:
             raise RigError(
@@ -183,8 +183,8 @@ def _refuse_unknown_poses(kind: str, ids: Sequence[str]) -> Rig:
 
 
 def _guessed_rig(rigs: Sequence[Rig], name: str) -> Rig:
-    """Join rigs of one pair each to one that only serves to record a session for `graphvio calibrate`.
+    """Join rigs of one pair each into one with guessed poses, to record a session for `graphvio calibrate`.
 
-    The first keeps its pose and its IMU; each of the others has an IMU of its own, which is not used.
+    The first rig keeps its pose and its IMU; each of the others has an IMU of its own, which is not used.
     """
     return joined_rig([rigs[0], *(rig.without_imu() for rig in rigs[1:])], name)[0]

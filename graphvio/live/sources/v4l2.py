@@ -1,6 +1,6 @@
-"""UVC stereo cameras by Video4Linux: both images side by side from one device, or a device for each camera.
+"""Live source of UVC stereo cameras by Video4Linux: both images side by side from one device, or a device per camera.
 
-Images are passed on as the driver delivers them, and converted when they are decoded. By OpenCV's back-end
+Images are passed on as the driver delivers them, and converted when they are decoded. In OpenCV's back-end
 (``modules/videoio/src/cap_v4l.cpp``), ``CAP_PROP_POS_MSEC`` is the time stamp of the buffer that was grabbed last;
 exposures are in units of 100 us; 1 is manual and 3 is automatic exposure; without ``CAP_PROP_CONVERT_RGB``, a JPEG is a
 row of bytes and YUYV has two channels.
@@ -48,7 +48,7 @@ _Part = tuple[str, slice, slice]  # a camera's name, and the rows and columns of
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Settings of a device."""
+    """Settings of a video device."""
 
     size_px: tuple[int, int]  # (width, height) of the whole image, of both cameras where they are side by side
     fps: float | None = None  # images a second, or None for the driver's choice
@@ -150,10 +150,10 @@ def _fourcc(text: str) -> int:
 
 
 def stamp_of(capture: Capture) -> int | None:
-    """Return `host_ns` of the image that was grabbed last, or None if its stamp is not of a clock of the host.
+    """Return the stamp, as of `host_ns`, of the image grabbed last; None if it is not by one of the host's clocks.
 
-    Drivers stamp by ``CLOCK_MONOTONIC`` or, by uvcvideo's parameter ``clock``, ``CLOCK_REALTIME``; the clock whose time
-    is near is taken.
+    Drivers stamp by ``CLOCK_MONOTONIC`` or, with uvcvideo's parameter ``clock``, by ``CLOCK_REALTIME``; the clock whose
+    time is near the stamp is assumed.
     """
     stamp_ns = round(1e6 * capture.get(cv2.CAP_PROP_POS_MSEC))
     if abs(stamp_ns - time.monotonic_ns()) < _MAX_AGE_NS:
@@ -164,7 +164,7 @@ def stamp_of(capture: Capture) -> int | None:
 
 
 class GreyImage:
-    """An image as the driver delivered it, converted to grey once for all its parts; from any thread."""
+    """An image as the driver delivered it, converted to grey once for all its parts; usable from any thread."""
 
     def __init__(self, raw: AnyArray, pixel_format: str, size_px: tuple[int, int], where: str) -> None:
         self._raw: AnyArray | None = raw
@@ -342,7 +342,7 @@ def _cameras(
 
 
 def _parts(group: Sequence[Camera]) -> tuple[tuple[int, int], list[_Part]]:
-    """Return the size of an image with these cameras side by side, and the part of each."""
+    """Return the size of an image with these cameras side by side, and each camera's part of it."""
     parts: list[_Part] = []
     left = 0
     for camera in group:

@@ -1,1 +1,1 @@
-"""Loop closure: recognition of places by any pair, and the relative pose between the visits."""
+"""Loop closure: recognition of places by any pair, and estimation of the relative pose between two visits."""

@@ -1,4 +1,4 @@
-"""Features of places while the odometry still runs, which leaves a part of the cores idle."""
+"""Extraction of places' features while the odometry still runs, which leaves some cores idle."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from graphvio.sources import Source
 class FeaturesAhead:
     """Extracts the features of places in a thread and a process as soon as their poses are final; a context manager.
 
-    `add` and `add_smoothed` follow the odometry. Places are chosen as `choose_places` does afterwards, up to the first
-    frameset whose final pose is missing; at the end the place at work is finished, and the others are left for
-    `extract_places`.
+    `add` and `add_smoothed` take the output of the odometry. Places are chosen as `choose_places` does afterwards, up
+    to the first frameset whose final pose is missing; at the end the place being processed is finished, and the others
+    are left to `extract_places`.
 
     Args:
-        source: of the images.
-        rig: of their cameras.
-        session: its name in the database.
-        database: path; a new file, or that of an interrupted run of the same.
-        config: of all stages.
+        source: the recording with the images.
+        rig: the rig of their cameras.
+        session: name of the session in the database.
+        database: path of the database: a new file, or that of an interrupted run of the same session.
+        config: configuration of all stages.
     """
 
     def __init__(self, source: Source, rig: Rig, session: str, database: Path, config: Config) -> None:
@@ -43,7 +43,7 @@ class FeaturesAhead:
         self._database = database
         self._config = config
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)
-        self._epochs: dict[int, int] = {}  # of framesets whose final pose is awaited, in order
+        self._epochs: dict[int, int] = {}  # stamp -> epoch, of framesets whose final pose is awaited, in order
         self._references: set[int] = set()
         self._final: dict[int, Float] = {}
         self._chosen: queue.SimpleQueue[int | None] = queue.SimpleQueue()
@@ -59,7 +59,7 @@ class FeaturesAhead:
         self._thread.join()
 
     def stop(self) -> None:
-        """Extract no features of more places than the one at work."""
+        """Extract no more features once the place being processed is finished."""
         self._is_stopped = True
         self._chosen.put(None)
 
@@ -89,4 +89,4 @@ class FeaturesAhead:
                         seen = observer.look(self._source.frameset_at(stamp_ns))
                         store_place(database, self._rig, self._session, stamp_ns, seen)
         except GraphvioError:
-            pass  # `extract_places` meets it again, and reports it
+            pass  # `extract_places` runs into the same error, and reports it

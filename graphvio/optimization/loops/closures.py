@@ -24,8 +24,8 @@ class Place:
     """A keyframe whose images are searched for loop closures."""
 
     session: int  # number of the session
-    row: int  # of the frameset in the session's record
-    stamp_ns: int  # of the frameset
+    row: int  # row of the frameset in the session's record
+    stamp_ns: int  # stamp of the frameset
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class LoopClosure:
 
     reference: Place  # the earlier place
     current: Place  # the later one
-    reference_T_current: Float  # (4, 4) of body
+    reference_T_current: Float  # (4, 4) motion of body
     covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the current place
     inliers: int  # number of points
     pairs: tuple[tuple[int, int], ...]  # (pair at the reference, pair at the current place) that saw the same points
@@ -42,7 +42,7 @@ class LoopClosure:
 
 
 def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
-    """Make a loop closure of a resection; its covariance allows for correlated errors of the points."""
+    """Make a loop closure from a resection; its covariance allows for correlated errors of the points."""
     return LoopClosure(
         earlier,
         later,

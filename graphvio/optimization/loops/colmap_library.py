@@ -16,7 +16,7 @@ CENTRE_PX = 0.5
 
 
 def colmap() -> Any:
-    """Import pycolmap, with logging from warnings on.
+    """Import and return pycolmap, set to log warnings and errors only.
 
     Raises:
         OptimizationError: if it was imported in an order that corrupts memory.
@@ -34,7 +34,7 @@ def colmap() -> Any:
 
 @contextmanager
 def only_errors_logged() -> Iterator[None]:
-    """Keep COLMAP from logging warnings meanwhile."""
+    """Keep COLMAP from logging warnings inside the context."""
     logging = colmap().logging
     before = logging.minloglevel
     logging.minloglevel = logging.Level.ERROR.value

@@ -36,7 +36,7 @@ def colmap_model(camera: Camera) -> str:
     """Return the name of COLMAP's model for a camera's lens.
 
     Raises:
-        OptimizationError: if it has none.
+        OptimizationError: if COLMAP has no model for it.
     """
     if camera.model == "radial-tangential" and not camera.distortion[4]:
         return "OPENCV"
@@ -107,13 +107,13 @@ class FeatureDatabase:
         return self._colmap.DatabaseTransaction(self._file)  # type: ignore[no-any-return]
 
     def rig_of(self, session: str, rig: Rig) -> tuple[int, dict[str, int]] | None:
-        """Return what `add_rig` returned for the rig of a session; None if the session has no images."""
+        """Return the numbers of a session's rig and cameras, as `add_rig` does; None if the session has no images."""
         taken = next((number for name, number in self._ids.items() if name.rsplit("/", 2)[0] == session), None)
         if taken is None:
             return None
         sensor = self._colmap.sensor_t(self._colmap.SensorType.CAMERA, self._file.read_image(taken).camera_id)
         found = self._file.read_rig_with_sensor(sensor)
-        others = sorted(each.id for each in found.non_ref_sensors)  # in the order of writing
+        others = sorted(each.id for each in found.non_ref_sensors)  # ids are in the order of writing
         names = [camera.name for camera in rig.cameras]
         return found.rig_id, dict(zip(names, [found.ref_sensor_id.id, *others], strict=True))
 
@@ -173,7 +173,7 @@ class FeatureDatabase:
         return np.asarray(self._file.read_descriptors(self._ids[name]).data, dtype=np.uint8).reshape(-1, 128)
 
     def add_matches(self, first: str, second: str, matches: Int, geometry: Any = None) -> None:
-        """Add matches (M, 2) of two images, verified by a geometry; None where all are, as those of a stereo pair."""
+        """Add matches (M, 2) of two images and the geometry that verifies them; with None, all count as verified."""
         one, other = self._ids[first], self._ids[second]
         rows = np.ascontiguousarray(matches, dtype=np.uint32).reshape(-1, 2)
         self._file.write_matches(one, other, rows)
@@ -206,7 +206,7 @@ class FeatureDatabase:
         return [(names[first], names[second]) for first, second in found]
 
     def verify(self, first: str, second: str, geometry: Any) -> None:
-        """Replace the two-view geometry that verifies the matches of two images; with None, none are verified."""
+        """Replace the two-view geometry that verifies the matches of two images; with None, no match is verified."""
         one, other = self._ids[first], self._ids[second]
         if self._file.exists_two_view_geometry(one, other):
             self._file.delete_two_view_geometry(one, other)
@@ -214,7 +214,11 @@ class FeatureDatabase:
             self._file.write_two_view_geometry(one, other, geometry)
 
     def model(self, rigs: Mapping[int, Float]) -> Any:
-        """Return a reconstruction without points of frames, given as number -> (4, 4) reference camera from world."""
+        """Return a reconstruction of frames without points; ``rigs`` gives their poses.
+
+        Args:
+            rigs: COLMAP's number of a frame -> ``cam_T_world`` (4, 4) of the rig's reference camera.
+        """
         file, made = self._file, self._colmap.Reconstruction()
         frames = [frame for frame in file.read_all_frames() if frame.frame_id in rigs]
         of_frames = {frame.rig_id for frame in frames}

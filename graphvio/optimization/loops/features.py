@@ -1,6 +1,6 @@
 """SIFT features of places, by COLMAP on the CPU, and their depth by the odometry's stereo matching.
 
-Features of single cameras have none here: see `graphvio.optimization.loops.motion_depth`.
+Features of single cameras get no depth here: see `graphvio.optimization.loops.motion_depth`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class PairFeatures:
 
     left: Float  # (K, 2) pixels in the left image, or the only one
     descriptors: AnyArray  # (K, 128) uint8, of the features in the left image
-    right: Float  # (M, 2) pixels in the right image of those with a stereo match; of a single camera none
-    in_right: Int  # (M,) their indices among the K
+    right: Float  # (M, 2) pixels in the right image of the features with a stereo match; empty for a single camera
+    in_right: Int  # (M,) indices of these features among the K
 
     @property
     def rows(self) -> Int:
@@ -41,7 +41,7 @@ class PairFeatures:
 class PlaceObserver:
     """Extracts the features of a place's images and matches them in stereo, in any thread; a context manager.
 
-    With ``in_processes``, each thread that asks for features has a process that extracts them: see `SiftProcess`.
+    With ``in_processes``, each calling thread has a process that extracts features for it: see `SiftProcess`.
     """
 
     def __init__(self, rig: Rig, config: Config, *, in_processes: bool = False) -> None:
@@ -77,7 +77,7 @@ class PlaceObserver:
         return made
 
     def look(self, frameset: FrameSet) -> dict[int, PairFeatures]:
-        """Return features of a frameset, by the index in the rig's groups."""
+        """Return the features of a frameset: index in the rig's groups -> features."""
         seen = {}
         for j, images in frameset.images.items():
             observer = self.groups[j]
@@ -139,7 +139,7 @@ def is_stored(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) 
 def store_place(
     database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: Mapping[int, PairFeatures]
 ) -> None:
-    """Write the features of a place to the database, all or nothing."""
+    """Write the features of a place to the database, in one transaction."""
     names = {camera.name: image_name(session, camera.name, stamp_ns) for j in seen for camera in rig.groups[j].cameras}
     with database.transaction():
         rig_id, cameras = database.rig_of(session, rig) or database.add_rig(rig)
@@ -157,7 +157,7 @@ def merge_places(
 ) -> None:
     """Copy places from one database to another.
 
-    Parts that are copied in the order of time give the same rows as `extract_places` for all places at once.
+    If parts are copied in the order of time, the rows are the same as those of `extract_places` for all places at once.
     """
     for stamp_ns in stamps_ns:
         seen = {}

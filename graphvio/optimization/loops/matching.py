@@ -1,4 +1,4 @@
-"""Matches of the features of two images by their descriptors, and their verification by two-view geometry."""
+"""Matching of the features of two images by their descriptors, and verification of matches by two-view geometry."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from graphvio.optimization.loops.database import colmap_camera
 from graphvio.rig import Camera
 
 _UNIT = 512.0**2  # COLMAP scales descriptors to this squared length
-_MAX_ANGLE_RAD = 0.7  # between matching descriptors; COLMAP's
-_MAX_RATIO = 0.8  # of the best angle to the second best; COLMAP's
-_MIN_LENGTH = 1e-12  # of the normal of an epipolar plane; two views from one point have none
+_MAX_ANGLE_RAD = 0.7  # between matching descriptors; COLMAP's value
+_MAX_RATIO = 0.8  # of the best angle to the second best; COLMAP's value
+_MIN_LENGTH = 1e-12  # of the normal of an epipolar plane, which is zero for two views from one point
 
 
 def alike(first: AnyArray, second: AnyArray) -> Int:
     """Match descriptors (K, 128) and (L, 128), uint8, as COLMAP's matcher on the CPU does; returns rows (M, 2) of both.
 
-    Matches are each other's nearest, and pass the ratio test.
+    Two matching descriptors are each other's nearest, and both pass the ratio test.
     """
     if not len(first) or not len(second):
         return np.zeros((0, 2), dtype=np.int64)
-    products = first.astype(np.float32) @ second.astype(np.float32).T  # of integers: exact
+    products = first.astype(np.float32) @ second.astype(np.float32).T  # exact, as the entries are integers
     second_of, is_clear = _best(products)
     first_of, is_clear_back = _best(np.ascontiguousarray(products.T))
     mutual = is_clear & is_clear_back[second_of] & (first_of[second_of] == np.arange(len(first)))
@@ -34,7 +34,7 @@ def alike(first: AnyArray, second: AnyArray) -> Int:
 
 
 def _best(products: AnyArray) -> tuple[Int, Bool]:
-    """Return each row's column with the largest product (K,), and whether that passes both thresholds (K,)."""
+    """Return the column with the largest product in each row (K,), and whether it passes both thresholds (K,)."""
     rows = np.arange(len(products))
     best = np.argmax(products, axis=1)
     largest = products[rows, best]
@@ -60,10 +60,10 @@ def known_geometry(
     """Return COLMAP's two-view geometry of a known motion, with the matches that agree with it.
 
     Args:
-        cameras: of the two images.
-        second_T_first: (4, 4).
-        pixels: features (K, 2) and (L, 2).
-        rows: matches (M, 2).
+        cameras: the cameras of the two images.
+        second_T_first: the motion (4, 4) between the cameras.
+        pixels: features (K, 2) and (L, 2) of the two images.
+        rows: matches (M, 2) of the features.
         max_error_px: maximum angle to the epipolar plane, times the focal length.
     """
     essential = skew(second_T_first[:3, 3]) @ second_T_first[:3, :3]

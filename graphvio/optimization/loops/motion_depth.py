@@ -1,8 +1,8 @@
 """Depth of single cameras' features from the motion between a place and its neighbours.
 
-Features that match those of a neighbouring place are triangulated with the motion of body in between. What is not known
-of that motion, and with it of the scale, is an error that all features have in common: covariances of single features
-cannot hold it. Each direction of it is therefore a shift of all inverse depths together.
+Features that match those of a neighbouring place are triangulated with the motion of body in between. The error of that
+motion, and with it that of the scale, is common to all features, so that the covariances of single features cannot
+express it. Each direction of this error is therefore kept as a shift of all inverse depths together.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Camera
 
 FEATURE_SIGMA_PX = 0.7
-"""Standard deviation of a SIFT feature's place in an image."""
+"""Standard deviation of a SIFT feature's pixel coordinates."""
 NEIGHBOURS = (-2, -1, 1, 2)
-"""Which places beside a place its features are matched with."""
+"""Offsets in a session's list of places: the neighbours with whose features those of a place are matched."""
 _MIN_DEPTH_SIGMAS = 3.0  # a more uncertain inverse depth constrains no motion in metres
 _MIN_BASELINE_M = 0.02
-_DIMENSIONS = 6  # of a motion
-_THEN, _NOW = 0, 1  # instants of a neighbour and of the place
+_DIMENSIONS = 6  # degrees of freedom of a motion
+_THEN, _NOW = 0, 1  # stand-ins for the stamps of a neighbour and of the place
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,12 @@ class PlaceMotion:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Features of one camera at a place, and what is not known of all their depths together."""
+    """Features of one camera at a place with their depths, and the errors that all these depths have in common."""
 
-    # the features as tracks, with covariances of what the pixels do not show; ``has_depth`` are those whose inverse
-    # depth exceeds three standard deviations
+    # the features as tracks, with covariances due to the noise of the pixels; ``has_depth`` where the inverse depth
+    # exceeds three standard deviations
     frame: TrackedFrame
-    shifts: Float  # (S, K) of their inverse depths, 1/m, for one standard deviation of each of S errors
+    shifts: Float  # (S, K) shifts of their inverse depths, 1/m, for one standard deviation of each of S errors
 
 
 def undetermined(camera: Camera, stamp_ns: int, pixels: Float) -> TrackedFrame:
@@ -73,7 +73,8 @@ def located(
 ) -> Located:
     """Triangulate a single camera's features at a place with its features at neighbouring places, if it has any there.
 
-    Of several neighbours that see a feature, the one that knows its depth best counts. Each has six shifts.
+    Of several neighbours that see a feature, the one with the smallest variance of its inverse depth is used. The error
+    of each neighbour's motion gives six shifts.
     """
     frame = undetermined(camera, stamp_ns, features.pixels)
     points, covariances, has_depth = frame.points.copy(), frame.covariances.copy(), frame.has_depth.copy()
@@ -104,7 +105,7 @@ def located(
 
 
 def _shifts(camera: Camera, rays: Float, then: Float, motion: PlaceMotion, found: Float) -> Float:
-    """Return the shifts (6, M) of inverse depths for one standard deviation of the motion's error along each axis."""
+    """Return the shifts (6, M) of inverse depths for one standard deviation along each axis of the motion's error."""
     sizes, axes = np.linalg.eigh(motion.covariance)
     steps = axes * np.sqrt(np.maximum(sizes, 0.0))
     return np.array(
@@ -117,7 +118,10 @@ def _shifts(camera: Camera, rays: Float, then: Float, motion: PlaceMotion, found
 
 
 def _triangulated(camera: Camera, rays: Float, then: Float, place_T_neighbour: Float) -> tuple[Float, Float]:
-    """Return points (M, 3) ``[x, y, 1/Z]`` at a place, and covariances (M, 3, 3), of rays (M, 2) there and before."""
+    """Triangulate rays (M, 2) at a place with those ``then`` (M, 2) at a neighbour.
+
+    Returns points (M, 3) ``[x, y, 1/Z]`` at the place, and covariances (M, 3, 3).
+    """
     sights, history, ids = FirstSights(), MotionHistory(), np.arange(len(rays))
     history.restart(_THEN)
     sights.locate(ids, then, history, camera.body_T_cam, camera.focal_px, FEATURE_SIGMA_PX)

@@ -14,16 +14,16 @@ from graphvio.geometry import se3_inverse, so3_log
 from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Camera, StereoPair
 
-_LEVELS = 2  # of the pyramid, enough for stereo matching
+_LEVELS = 2  # of the image pyramid, enough for stereo matching
 
 
 class PlaceChooser:
-    """Chooses keyframes, one after the other, at this distance or angle from the place before."""
+    """Chooses keyframes as places, one after the other, at least a distance or angle from the previous place."""
 
     def __init__(self, distance_m: float, angle_deg: float) -> None:
         self._distance_m = distance_m
         self._angle_deg = angle_deg
-        self._last: tuple[int, Float] | None = None  # epoch and pose of the place before
+        self._last: tuple[int, Float] | None = None  # epoch and pose of the previous place
 
     def takes(self, epoch: int, nav_T_body: Float) -> bool:
         """Return whether the next keyframe, with the pose (4, 4), is a place."""
@@ -37,7 +37,7 @@ class PlaceChooser:
 
 
 def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) -> Int:
-    """Choose keyframes at this distance or angle from the place before; returns their rows (P,)."""
+    """Choose keyframes as places, at least a distance or angle from the previous place; returns their rows (P,)."""
     chooser = PlaceChooser(distance_m, angle_deg)
     keyframes = np.flatnonzero(record.is_keyframe).tolist()
     chosen = [row for row in keyframes if chooser.takes(int(record.epoch[row]), record.smoothed[row])]
@@ -45,7 +45,7 @@ def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) ->
 
 
 class ImageObserver:
-    """Finds out which features in one camera's image may be used."""
+    """Decides which features in one camera's image are used."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self._allowed = UsablePixels(camera, config.tracking.window_px).always
@@ -57,7 +57,7 @@ class ImageObserver:
 
 
 class PairObserver(ImageObserver):
-    """Also finds the depth of features in one pair's left image by stereo matching."""
+    """Decides which features in one pair's left image are used, and finds their depth by stereo matching."""
 
     def __init__(self, pair: StereoPair, config: Config) -> None:
         super().__init__(pair.left, config)
@@ -74,10 +74,10 @@ class PairObserver(ImageObserver):
         """Return a frame whose tracks are these features.
 
         Args:
-            stamp_ns: of the images.
-            images: left and right.
-            pixels: (N, 2) in the left one.
-            inverse_depths: (N,) expected, 1/m; NaN or None where unknown.
+            stamp_ns: stamp of the images.
+            images: left and right image.
+            pixels: features (N, 2) in the left image.
+            inverse_depths: expected inverse depths (N,), 1/m; NaN or None where unknown.
         """
         left, right = (build_pyramid(np.ascontiguousarray(image), _LEVELS) for image in images)
         rays, has_ray = self.pair.left.unproject(pixels)

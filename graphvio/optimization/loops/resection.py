@@ -1,9 +1,9 @@
 """3D-2D resection between two places, across any pairs and single cameras.
 
-Points that pair a triangulated at the reference, or the motion to neighbouring places if a is a single camera, are seen
-by pair b at the current place. Each such (a, b) is treated as a pair of its own by the search and refinement of section
-3.1, see `RigArrays.crossed`. SIFT features are accurate to about half a pixel; where a pair sees the same points at
-both places, their patches are then registered to a tenth.
+Pair a at the reference gives points, by stereo or, if it is a single camera, by the motion to neighbouring places; pair
+b at the current place sees them. Each such (a, b) is treated as a pair of its own by the search and refinement of
+section 3.1, see `RigArrays.crossed`. SIFT features are accurate to about half a pixel; where a pair sees the same
+points at both places, their patches are then registered to a tenth of a pixel.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
 
 _FEATURE_MAX_ERROR_PX = 4.0
-_ROUNDS = 2  # of registration, the second predicted from the motion of the first
+_ROUNDS = 2  # of registration; the second is predicted with the motion that the first found
 _MIN_REGISTERED = 30
 
 
@@ -39,12 +39,12 @@ _MIN_REGISTERED = 30
 class Resection:
     """A motion between two places."""
 
-    cur_T_ref: Float  # (4, 4) of body
+    cur_T_ref: Float  # (4, 4) motion of body
     covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the current place
-    inliers: int  # number of points
+    inliers: int  # number of inlier points
     pairs: tuple[tuple[int, int], ...]  # (pair at the reference, pair at the current place) that saw the same points
     is_registered: bool  # whether patches were registered, not only features matched
-    # (6, 6), same tangent, by errors that all points have in common; it is no part of ``covariance``
+    # (6, 6), same tangent, due to errors that all points have in common; it is not included in ``covariance``
     shared_covariance: Float = field(default_factory=lambda: np.zeros((6, 6)))
 
 
@@ -60,14 +60,14 @@ def resect_features(
     """Estimate the motion between two places from matched features; None if they do not support one.
 
     Args:
-        rig: of the pairs.
+        rig: the rig with the pairs and single cameras.
         reference: pair index -> its features with depth at the reference.
         current: pair index -> its features with depth at the current place.
         matches: (a, b) -> matches (M, 2) of a's features at the reference and b's at the current place.
-        config: of the motion.
-        seed: of RANSAC.
-        shifts: single camera's index -> (S, K) of its inverse depths at the reference, for one standard deviation of
-            each of S errors that are common to all; None without single cameras.
+        config: the configuration of the motion estimate.
+        seed: the seed of RANSAC.
+        shifts: single camera's index -> shifts (S, K) of its features' inverse depths at the reference, for one
+            standard deviation of each of S errors that all features have in common; None without single cameras.
     """
     crossings = sorted(matches)
     observations = _observations(reference, current, [(pair, matches[pair]) for pair in crossings])
@@ -90,7 +90,7 @@ def resect_features(
 
 
 def _shifts_of(reference: TrackedFrame, rows: Int, shifts: Float | None) -> Float:
-    """Return the shifts (S, M) of matched features that have a depth; of a pair's features (0, M)."""
+    """Return the shifts (S, M) of the matched features that have a depth; (0, M) for features of a stereo pair."""
     rows = rows[reference.has_depth[rows[:, 0]], 0]
     return np.zeros((0, len(rows))) if shifts is None else np.asarray(shifts[:, rows])
 
@@ -98,14 +98,14 @@ def _shifts_of(reference: TrackedFrame, rows: Int, shifts: Float | None) -> Floa
 def _shared_covariance(
     rig: RigArrays, observations: Observations, shifts: Float, cur_T_ref: Float, settings: MotionConfig
 ) -> Float:
-    """Return the covariance (6, 6), in body at the current place, by errors that shift the depths of all points.
+    """Return the covariance (6, 6), in body at the current place, due to errors that shift the depths of all points.
 
     Args:
-        rig: of the crossings.
+        rig: the arrays of the rig for the crossings.
         observations: N inliers.
-        shifts: (S, N) of their inverse depths.
-        cur_T_ref: (4, 4) without shifts.
-        settings: of the motion.
+        shifts: shifts (S, N) of their inverse depths.
+        cur_T_ref: the motion (4, 4) without shifts.
+        settings: the configuration of the motion estimate.
     """
     covariance = np.zeros((6, 6))
     for shift in shifts:
@@ -125,8 +125,8 @@ def register_patches(
 ) -> Resection:  # fmt: skip
     """Refine a motion by registering the patches of pairs that see the same points at both places.
 
-    Returns the given motion if too few patches can be registered. Arguments are those of `resect_features`, and the
-    images of the reference and of the current place.
+    Returns the given motion if too few patches can be registered. Arguments are those of `resect_features`, the motion
+    to refine, and the images of the reference and of the current place.
     """
     then, now = images
     pairs = sorted({a for a, b in found.pairs if a == b and a in then.stereo and a in now.stereo})
@@ -175,7 +175,7 @@ def _observations(
     current: Mapping[int, TrackedFrame],
     matches: Sequence[tuple[tuple[int, int], Int]],
 ) -> Observations:
-    """Return matched features with depth at the reference, ordered by the pairs that saw them."""
+    """Return the matches whose feature has a depth at the reference as observations, ordered by crossing."""
     parts = []
     for number, ((a, b), rows) in enumerate(matches):
         then, now = reference[a], current[b]

@@ -15,18 +15,19 @@ import numpy as np
 from graphvio.arrays import AnyArray, Int
 
 _WORDS = 64
-_SAMPLE = 40_000  # of descriptors for the vocabulary
+_SAMPLE = 40_000  # number of descriptors that the vocabulary is computed from
 _ITERATIONS = 15
-_LENGTH = 512.0  # of COLMAP's descriptors
+_LENGTH = 512.0  # Euclidean length of COLMAP's descriptors
 
 
 def vocabulary(descriptors: Iterable[AnyArray], images: int, seed: int, max_words: int = _WORDS) -> AnyArray:
-    """Cluster descriptors to words (W, 128) by k-means.
+    """Cluster descriptors into words (W, 128) by k-means.
 
     Args:
-        descriptors: (K, 128) uint8, of each image; iterated once, as those of an hour may not fit in memory.
-        images: their number.
-        seed: of the sample and of the initial words.
+        descriptors: descriptors (K, 128), uint8, of each image; iterated once, as those of a recording of an hour may
+            not fit in memory.
+        images: number of images.
+        seed: seed of the sample and of the initial words.
         max_words: number of words, if there are as many descriptors.
     """
     rng = np.random.default_rng(seed)
@@ -56,7 +57,7 @@ def _initial_labels(sample: AnyArray, words: int, rng: np.random.Generator) -> A
 
 
 def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
-    """Return an image's VLAD vector (W * 128,), of length one, or zero for an image without features."""
+    """Return an image's VLAD vector (W * 128,), of Euclidean length one, or zero for an image without features."""
     made = np.zeros_like(words)
     if len(descriptors) and len(words):
         rows = descriptors.astype(np.float32) / np.float32(_LENGTH)
@@ -74,13 +75,13 @@ def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
 def most_similar(
     own: AnyArray, vectors: AnyArray, firsts: Int, may: Callable[[int], bool], count: int
 ) -> list[tuple[float, int]]:
-    """Return similarity and index of the places most similar to a place, by their most similar images.
+    """Return similarity and index of the known places most similar to a place, compared by their most similar images.
 
     Args:
-        own: (K, D) vectors of the place's images.
-        vectors: (N, D) vectors of the images of P known places, place by place.
-        firsts: (P,) first row of each known place.
-        may: whether a known place may be returned, given its index.
+        own: vectors (K, D) of the place's images.
+        vectors: vectors (N, D) of the images of P known places, place by place.
+        firsts: first row (P,) of each known place in ``vectors``.
+        may: returns whether a known place may be returned, given its index.
         count: maximum number of places.
     """
     by_place = np.maximum.reduceat(np.max(own @ vectors.T, axis=0), firsts)
@@ -97,10 +98,10 @@ def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], c
     """Return pairs (earlier, later) of each place and the earlier ones most similar to it, the most similar first.
 
     Args:
-        vectors: (N, D) of images, of length one.
-        place: (N,) number of each image's place, in order.
-        may: whether an earlier and a later place may be compared.
-        count: maximum number of candidates of a place.
+        vectors: vectors (N, D) of the images, of length one.
+        place: number (N,) of each image's place, in increasing order.
+        may: returns whether an earlier and a later place may be compared.
+        count: maximum number of candidates per place.
     """
     found: list[tuple[float, int, int]] = []
     numbers, firsts = np.unique(place, return_index=True)

@@ -28,11 +28,11 @@ from graphvio.sources import Source
 class SessionInput:
     """A session to search."""
 
-    name: str  # of the session, unique
-    source: Source  # of its images
-    rig: Rig  # of the cameras
-    places: Sequence[Place]  # in the order of time
-    record: SessionRecord  # of its motions, by which single cameras' features get a depth
+    name: str  # unique name of the session
+    source: Source  # recording with its images
+    rig: Rig  # rig of its cameras
+    places: Sequence[Place]  # places to search, in the order of time
+    record: SessionRecord  # record of its motions, with which single cameras' features are triangulated
 
 
 def find_loops(
@@ -44,7 +44,7 @@ def find_loops(
     """Find loop closures between places that are far apart in time or of different sessions.
 
     The places are in the database already; verified matches are added to it. ``on_progress`` is called with the number
-    of finished candidates and of all.
+    of finished candidates and of all candidates.
     """
     places = [place for session in sessions for place in session.places]
     images = _described(sessions, places, database, config.motion.seed)
@@ -70,7 +70,7 @@ def find_loops(
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """N left or single images: number of the place (N,), index of the group (N,), names, and VLAD vectors (N, D)."""
+    """N left or single images: number of the place (N,), index in the rig's groups (N,), names, VLAD vectors (N, D)."""
 
     place: Int
     pair: Int
@@ -104,7 +104,7 @@ def _described(
 
 
 class _Verifier:
-    """Verifies candidates, from any thread."""
+    """Verifies candidate pairs of places; may be called from any thread."""
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ class _Verifier:
                 self._database.add_matches(first, second, rows, geometry)
 
     def _neighbours(self, number: int) -> list[tuple[PlaceView, PlaceMotion]]:
-        """Return the places next to a place in its session, and the motions to them where they are known."""
+        """Return the places next to a place in its session to which the motion is known, and these motions."""
         place = self._places[number]
         found: list[tuple[PlaceView, PlaceMotion]] = []
         for step in NEIGHBOURS:

@@ -1,4 +1,4 @@
-"""SIFT features by COLMAP on the CPU, in this process or in one of its own.
+"""Extraction of SIFT features by COLMAP on the CPU, in this process or in a separate one.
 
 pycolmap holds the interpreter's lock while it extracts, so that threads gain nothing.
 """
@@ -22,7 +22,7 @@ _PROGRAM = "from graphvio.optimization.loops.sift import serve; serve()"
 
 
 class SiftExtractor:
-    """Extracts at most so many features of an image, the largest ones, in the calling thread."""
+    """Extracts the largest features of an image, at most ``features`` of them, in the calling thread."""
 
     def __init__(self, features: int) -> None:
         library = colmap()
@@ -41,11 +41,11 @@ class SiftExtractor:
         return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
 
     def close(self) -> None:
-        """Do nothing: a `SiftProcess` has something to close."""
+        """Do nothing; the method exists because a `SiftProcess` has to be closed."""
 
 
 class SiftProcess:
-    """Does the same in a process of its own, which ends with this one at the latest; for one thread at a time."""
+    """A `SiftExtractor` in a separate process, which ends with this one at the latest; for one thread at a time."""
 
     def __init__(self, features: int) -> None:
         pipe = subprocess.PIPE
@@ -81,7 +81,7 @@ class SiftProcess:
 
 
 def serve() -> None:
-    """Extract the features of the pickled images of the standard input until it ends."""
+    """Extract features of pickled images from standard input until it ends; the features go to standard output."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks handles Ctrl-C
     images, features = sys.stdin.buffer, sys.stdout.buffer
     extractor = SiftExtractor(pickle.load(images))

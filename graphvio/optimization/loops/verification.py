@@ -24,12 +24,12 @@ from graphvio.optimization.loops.resection import Resection, register_patches, r
 from graphvio.rig import CameraGroup, Rig, SingleCamera
 
 _MIN_MATCHES = 20
-_MAX_CROSSINGS = 2  # pairs of images of a candidate that are matched
+_MAX_CROSSINGS = 2  # number of image pairs that are matched for each candidate
 
 
 @dataclass(frozen=True, eq=False)
 class StoredView:
-    """A place in a database, which is read under a lock; j is an index in the rig's groups."""
+    """A place whose features are in a database, which is read under a lock; j is an index in the rig's groups."""
 
     rig: Rig
     session: str
@@ -39,21 +39,21 @@ class StoredView:
     frameset_at: Callable[[int], FrameSet]
 
     def name(self, j: int) -> str:
-        """Return the name of the left image in the database, or of a single camera's."""
+        """Return the name in the database of the left image, or of a single camera's image."""
         return image_name(self.session, self.rig.groups[j].left.name, self.stamp_ns)
 
     def sees(self, j: int) -> bool:
-        """Return whether there is such an image."""
+        """Return whether the database has this image."""
         return self.name(j) in self.database.names
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """Return pixels (K, 2) and descriptors (K, 128), uint8, of the left image, or of a single camera's."""
+        """Return pixels (K, 2) and descriptors (K, 128), uint8, of the left image, or of a single camera's image."""
         name = self.name(j)
         with self.lock:
             return self.database.pixels(name), self.database.descriptors(name)
 
     def frame(self, j: int) -> TrackedFrame:
-        """Return the same features with their depth; those of a single camera have none."""
+        """Return the same features as a frame with their depth; those of a single camera have none."""
         group, left = self.rig.groups[j], self.name(j)
         if isinstance(group, SingleCamera):
             return undetermined(group.left, self.stamp_ns, self.features(j)[0])
@@ -64,17 +64,17 @@ class StoredView:
         return frame_of(group, self.stamp_ns, pixels, in_right, rows)
 
     def frameset(self) -> FrameSet:
-        """Return the place's images, as far as they still exist."""
+        """Return those of the place's images that still exist."""
         return self.frameset_at(self.stamp_ns)
 
 
 @dataclass(frozen=True, eq=False)
 class FreshView:
-    """A place in memory."""
+    """A place whose images and features are in memory, with the methods of `StoredView`."""
 
     rig: Rig
     images: FrameSet
-    seen: Mapping[int, PairFeatures]  # by the index in the rig's groups
+    seen: Mapping[int, PairFeatures]  # index in the rig's groups -> features
 
     def sees(self, j: int) -> bool:
         """See `StoredView`."""
@@ -96,7 +96,7 @@ class FreshView:
 
 PlaceView = StoredView | FreshView
 Neighbours = Callable[[], Sequence[tuple[PlaceView, PlaceMotion]]]
-"""Returns the places of the same rig next to a place, and the motions from it to them."""
+"""A function that returns the neighbours of a place, seen by the same rig, and the motions from the place to them."""
 
 
 def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: AnyArray) -> list[tuple[int, int]]:
@@ -116,20 +116,20 @@ def verified(
     """Estimate the motion between two places that may be the same; None if they have too little in common.
 
     Args:
-        earlier: place whose points are used.
-        later: place that may see them.
+        earlier: the place whose points are used.
+        later: the place that may see them.
         tried: pairs of images to match, see `crossings`.
-        observers: of the rig's pairs, to register patches; None if the rigs differ.
-        config: of the search and the motion.
-        seed: of RANSAC.
-        neighbours: of the earlier place, from which the depth of single cameras' features is triangulated.
+        observers: observers of the rig's pairs, to register patches; None if the rigs differ.
+        config: the configuration of the search and the motion estimate.
+        seed: the seed of RANSAC.
+        neighbours: returns the neighbours of the earlier place, with which single cameras' features are triangulated.
         on_matched: called with a, b, their matches (M, 2), and the two-view geometry that verifies them.
     """
     matches = {}
     for a, b in tried:
         rows, geometry = _matched(earlier, later, a, b)
         if len(rows) < _MIN_MATCHES:
-            break  # the others are less similar
+            break  # the remaining ones are less similar
         inliers = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
         if len(inliers) < _MIN_MATCHES:
             break
@@ -152,7 +152,7 @@ def verified(
 
 
 def _matched(earlier: PlaceView, later: PlaceView, a: int, b: int) -> tuple[Int, Any]:
-    """Return matches (M, 2) by descriptors, and COLMAP's two-view geometry, or None if they are few."""
+    """Return matches (M, 2) by descriptors, and COLMAP's two-view geometry, or None if there are too few matches."""
     (first, first_descriptors), (second, second_descriptors) = earlier.features(a), later.features(b)
     rows = alike(first_descriptors, second_descriptors)
     if len(rows) < _MIN_MATCHES:
@@ -162,7 +162,7 @@ def _matched(earlier: PlaceView, later: PlaceView, a: int, b: int) -> tuple[Int,
 
 
 def _with_depth(view: PlaceView, j: int, neighbours: Neighbours) -> Located:
-    """Return a place's features with their depth, those of a single camera by motion."""
+    """Return a place's features with their depth, which is triangulated by motion for a single camera."""
     frame, group = view.frame(j), view.rig.groups[j]
     if not isinstance(group, SingleCamera):
         return Located(frame, np.zeros((0, len(frame.ids))))

@@ -16,10 +16,10 @@ from graphvio.optimization.optimize import Optimization
 from graphvio.rig import Rig
 
 MAX_SIGMAS = 3.0
-"""A larger correction contradicts the rig file."""
+"""Largest correction, in standard deviations, that is consistent with the rig file."""
 
-_PROBABILITY = 0.9973  # of three standard deviations of one unknown
-_FIXED = 1e-7  # radians and metres: no measurement is that good
+_PROBABILITY = 0.9973  # within three standard deviations of one unknown
+_FIXED = 1e-7  # radians and metres: a smaller standard deviation is that of a fixed value, not of a measurement
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,17 @@ class PairCorrection:
     """The correction of a pair's extrinsics."""
 
     pair: int  # number of the pair
-    name: str  # of the pair, or empty
-    is_held: bool  # whether it is not estimated: without an IMU, the first pair defines body
+    name: str  # name of the pair, or empty
+    is_held: bool  # whether the pair is held fixed: without an IMU, the first pair defines body
     # point whose displacement is given: the pair's ``left camera``, or ``body's origin`` moved with the pair if the rig
     # is unknown
     of: str
-    angle_deg: float  # of the rotation
+    angle_deg: float  # angle of the correction's rotation
     angle_sigma_deg: float  # its standard deviation, largest over all axes
-    distance_m: float  # displacement
+    distance_m: float  # displacement of the point
     distance_sigma_m: float  # its standard deviation, largest over all directions
-    squared_distance: float | None  # mahalanobis, of rotation and translation, 6 degrees of freedom; None if held
+    # squared Mahalanobis distance of rotation and translation, 6 degrees of freedom; None if held
+    squared_distance: float | None
 
     @property
     def title(self) -> str:
@@ -55,7 +56,7 @@ class PairCorrection:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether the correction is consistent with the rig file, along each axis and together."""
+        """Whether the correction is consistent with the rig file: rotation and displacement, each and together."""
         if self.angle_sigmas is None or self.distance_sigmas is None or self.squared_distance is None:
             return True
         is_near = max(self.angle_sigmas, self.distance_sigmas) <= MAX_SIGMAS
@@ -153,7 +154,7 @@ def _pair(pair: int, correction: Float, covariance: Float, rig: Rig | None) -> P
     place = np.zeros(3) if known is None else np.ascontiguousarray(known.left.body_T_cam[:3, 3])
     rotation = np.ascontiguousarray(correction[:3, :3])
     moved_m = float(np.linalg.norm(rotation @ place + correction[:3, 3] - place))
-    by_tangent = np.hstack([-skew(place), np.eye(3)])  # of the place
+    by_tangent = np.hstack([-skew(place), np.eye(3)])  # displacement of the place by the tangent
     angle_sigma, sigma_m = _largest(covariance[:3, :3]), _largest(by_tangent @ covariance @ by_tangent.T)
     is_held = min(angle_sigma, sigma_m) < _FIXED
     tangent = se3_log(np.ascontiguousarray(correction))

@@ -17,7 +17,7 @@ from graphvio.optimization.report.numbers import Kind, Numbers, per_dimension, s
 from graphvio.reporting.figures import BLUE, GREEN, GREY, RED, add_axes, empty_figure
 
 _COLOURS = ("#1f5fbf", "#f28e1c", "#8e44ad", "#17a3b8", "#8c564b", "#555555", "#e377c2", "#9a9a00")
-"""Of sessions, in turn; green and red are loop closures'."""
+"""Colours of the sessions, in turn; green and red are those of loop closures."""
 
 _COLUMN_IN, _HEIGHT_IN = 4.5, 6.0
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _GAP_IN = 0.75, 0.15, 0.55, 0.3
@@ -26,7 +26,7 @@ _REFUSED, _REFUSED_ALPHA = "loop, refused", 0.15  # there may be hundreds
 _EDGE = {"markeredgecolor": "#111111", "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
 
 _PLAN_IN, _MIN_PLAN_IN, _PLAN_PER_ROW = 7.0, 3.2, 4
-_PLAN_TAIL = 0.05  # of the points on each side
+_PLAN_TAIL = 0.05  # share of the points on each side that the plan's limits may leave out
 
 _COLUMNS = 3
 _MIN_SQUARE, _MAX_SQUARE = 1e-4, 1e6  # squared distances per dimension within the bins
@@ -72,7 +72,7 @@ def plot_map(found: Optimization, numbers: Numbers, frame: int) -> Figure:
 def plot_plan(found: Optimization, numbers: Numbers, frame: int, points: Float | None) -> Figure:
     """Plot a frame from above: points of its map (N, 3), optimised trajectories, and loop closures.
 
-    A few points are far off; the plan ends where few more points would be seen.
+    The limits hold all trajectories and, along each axis, the inner 90 % of the points, as a few are far off.
     """
     lines = list(_lines(found, numbers, frame))
     shown = np.concatenate([line.columns[1][line.inside, :2] for line in lines])
@@ -99,7 +99,7 @@ def plot_plan(found: Optimization, numbers: Numbers, frame: int, points: Float |
     for line in lines:
         _plot_line(axes, line, 1, 1)
     centre, half = (low + high) / 2.0, np.array([width, height]) / inch_per_m / 2.0
-    axes.set_aspect("equal", adjustable="box")  # which the axes' place has already
+    axes.set_aspect("equal", adjustable="box")  # the axes' place already has this aspect
     axes.set_xlim(centre[0] - half[0], centre[0] + half[0])
     axes.set_ylim(centre[1] - half[1], centre[1] + half[1])
     axes.set_xlabel("x, m", fontsize=9)
@@ -204,7 +204,7 @@ def _lines(found: Optimization, numbers: Numbers, frame: int) -> Iterator[_Line]
 
 
 def _labels(found: Optimization, lines: list[_Line]) -> int:
-    """Return the largest number of labels in the legend."""
+    """Return the maximum number of labels that the legend may have."""
     judged = {not loop.refusal for loop in found.loops}
     epochs = sum(int((line.begins & line.inside).sum()) for line in lines) > len(lines)
     return len(lines) + len(judged) + epochs + 2
@@ -242,7 +242,7 @@ def _plot_loops(axes: Any, found: Optimization, lines: list[_Line], column: int,
 
 
 def _panels(points: Float, legend_in: float) -> tuple[Figure, list[tuple[Any, Any]]]:
-    """Return the figure, and plan and side view of each column: equal scales, axes that fit the data."""
+    """Make a figure with the axes of plan and side view in each column: equal scales, limits that fit the points."""
     low, high = points.min(axis=0), points.max(axis=0)
     centre, extent = 0.5 * (low + high), 1.12 * (high - low)
     extent[0] = max(extent[0], 0.6 * extent[1], 0.1)
@@ -275,7 +275,7 @@ def _panels(points: Float, legend_in: float) -> tuple[Figure, list[tuple[Any, An
 
 
 def _edges(kinds: Sequence[Kind]) -> Float:
-    """Return the edges of the bins for all kinds; the outermost bins include what lies beyond."""
+    """Return the edges of the bins for all kinds of factor; the outermost bins include the values beyond."""
     shown = [per_dimension(each) for kind in kinds for each in (kind.before, kind.after)]
     values = np.concatenate([np.ones(1), *shown])
     lowest, highest = np.log10(np.clip(np.quantile(values[values > 0.0], [0.005, 0.995]), _MIN_SQUARE, _MAX_SQUARE))
@@ -303,7 +303,7 @@ def _plot_kind(axes: Any, kind: Kind, edges: Float) -> None:
 
 
 def _unit(max_m: float) -> tuple[float, str]:
-    """Return a unit of length and its factor from metres."""
+    """Return the factor from metres to a unit of length, and the unit's name."""
     return (1e3, "mm") if max_m < 0.1 else (1.0, "m")
 
 

@@ -26,7 +26,7 @@ from graphvio.trajectory import Trajectory, travelled
 STAGES = ("online", "smoothed", "optimized")
 """Compared poses: as emitted, as the odometry's smoother left them, and optimised."""
 
-_KINDS = ("imu", "motion", "view", "zero_velocity", "walk", "start", "calibration", "loop")  # their order in the report
+_KINDS = ("imu", "motion", "view", "zero_velocity", "walk", "start", "calibration", "loop")  # in the report's order
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Part:
     """An epoch of a session, and the frame that it is in."""
 
     session: int  # number of the session
-    epoch: int  # of the session
+    epoch: int  # number of the epoch in the session
     frame: int  # number of the frame
-    framesets: int  # in the epoch
-    begin_s: float  # its first pose, in seconds since the session's first pose
-    end_s: float  # its last pose, likewise
+    framesets: int  # number of framesets with a pose in the epoch
+    begin_s: float  # time of its first pose, in seconds since the session's first pose
+    end_s: float  # time of its last pose, likewise
 
 
 @dataclass(frozen=True)
@@ -76,27 +76,27 @@ class Spread:
 class SessionNumbers:
     """Numbers of one session."""
 
-    name: str  # of the session
-    framesets: int  # that have a pose
-    completion: float | None  # their share of those that could have one; None if unknown
-    states: int  # of the graph
-    duration_s: float  # from the first pose to the last
-    length_m: float  # along the optimised positions
+    name: str  # name of the session
+    framesets: int  # number of framesets with a pose
+    completion: float | None  # their share of the framesets that could have one; None if unknown
+    states: int  # number of states in the graph
+    duration_s: float  # time from the first pose to the last
+    length_m: float  # length of the path along the optimised positions
     accuracy: Mapping[str, Accuracy] | None  # ATE by stage, or None
     no_accuracy: str  # why there is no ATE, or empty
     calibration: Sequence[str]  # sentences on what was found before the odometry; empty if it was not calibrated
     online: Float  # (F, 4, 4) online poses in the optimised frames
     moved_m: Float  # (F,) distance between online and optimised positions
     moved_deg: Float  # (F,) angle between online and optimised rotations
-    sigma_m: Float  # (N,) of the states' positions, all axes combined
-    sigma_deg: Float  # (N,) of the states' rotations, all axes combined
-    online_sigma_m: Float  # (F,) of the online positions
-    online_sigma_deg: Float  # (F,) of the online rotations
+    sigma_m: Float  # (N,) standard deviations of the states' positions, all axes combined
+    sigma_deg: Float  # (N,) standard deviations of the states' rotations, all axes combined
+    online_sigma_m: Float  # (F,) those of the online positions
+    online_sigma_deg: Float  # (F,) those of the online rotations
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """Factors of one kind, before and after; loop closures before: only those within an epoch."""
+    """Residuals of one kind of factor before and after; before, of loop closures only those within an epoch."""
 
     name: str
     before: Residuals
@@ -109,11 +109,11 @@ class Numbers:
 
     sessions: Sequence[SessionNumbers]  # in the order of the optimisation
     parts: Sequence[Part]  # epochs of all sessions
-    kinds: Sequence[Kind]  # of factors
+    kinds: Sequence[Kind]  # residuals by kind of factor
     used: int  # number of loop closures that are used
     refused: int  # number of loop closures that are refused
     loop_errors: Mapping[str, Spread]  # errors of the used loop closures, by stage
-    calibrations: Sequence[SessionCalibration | None]  # of each session; None where the calibration was not estimated
+    calibrations: Sequence[SessionCalibration | None]  # of each session; None where it was not estimated
     unknowns: int  # dimension of the solution
 
     @property
@@ -236,7 +236,7 @@ def _session_numbers(
 
 
 def _accuracy(session: OptimizedSession, truth: Trajectory | None) -> tuple[dict[str, Accuracy] | None, str]:
-    """Compute the ATE by stage; or None, and why."""
+    """Compute the ATE by stage and an empty text; or return None and the reason."""
     if truth is None:
         return None, "no ground truth"
     accuracy = {}
@@ -305,7 +305,7 @@ def _loop_residuals(found: Optimization) -> Residuals:
 
 
 def _loop_error(found: Optimization, closure: LoopClosure, stage: str) -> Float | None:
-    """Compute ``measured_T_current`` (4, 4) by the poses of a stage; None if these share no frame."""
+    """Compute a closure's error ``measured_T_current`` (4, 4) from a stage's poses; None if these share no frame."""
     first, second = closure.reference, closure.current
     one, other = found.sessions[first.session], found.sessions[second.session]
     if stage == "optimized":

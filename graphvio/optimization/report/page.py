@@ -1,4 +1,4 @@
-"""The HTML page of an optimisation's report: ``page.html`` and its numbers in words."""
+"""The HTML page of an optimisation's report: rendering of ``page.html``, and the numbers in words."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from graphvio.optimization.report.numbers import Numbers, median_sigmas
 from graphvio.reporting.html import render
 
 MAX_LOOPS = 200
-"""Rows of the table of loop closures."""
+"""Maximum number of rows in the table of loop closures."""
 
 _MAX_PARTS = 40
-_FACTOR = 2.0  # of squared residuals against the expected ones, before the noise is called different
+_FACTOR = 2.0  # of squared residuals to the expected ones, beyond which the noise is reported as different
 _PROBABILITY = 0.999
-_MAX_LOOP_SQUARES = 1.0  # mean square per dimension
+_MAX_LOOP_SQUARES = 1.0  # mean square per dimension of used loop closures above which they contradict the solution
 _MIN_COMPLETION = 0.9
 
 
 def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictures: Mapping[str, bytes]) -> str:
-    """Render the page with its PNGs: maps by frame, not of all, and ``residuals``, ``moved`` and ``sigmas``."""
+    """Render the page with its PNGs: maps of the largest frames, by frame, and ``residuals``, ``moved``, ``sigmas``."""
     return render(
         "optimization/report/page.html",
         found=found,
@@ -73,7 +73,7 @@ def size_of(transform: Float) -> tuple[float, float]:
 
 
 def _doubts(found: Optimization, numbers: Numbers) -> Iterator[str]:
-    """Yield what a reader must know before using the result."""
+    """Yield the warnings that a reader has to know before using the result, one sentence or more each."""
     if numbers.frames > 1:
         yield (
             f"Loop closures do not join all parts: there are {numbers.frames} frames, and positions in different ones "
@@ -110,7 +110,7 @@ def _doubts(found: Optimization, numbers: Numbers) -> Iterator[str]:
 
 
 def _medians(numbers: Numbers) -> Iterator[str]:
-    """Yield the median errors of motions, IMU and loop closures, before and after."""
+    """Yield the median errors of motions, IMU and loop closures, before and after the optimisation."""
     kinds = {kind.name: kind for kind in numbers.kinds}
     for kind, name in (("motion", "motions from images"), ("imu", "IMU"), ("loop", "loop closures that are used")):
         after = median_sigmas(kinds[kind].after) if kind in kinds else None

@@ -34,7 +34,7 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
 
     Args:
         found: the optimisation.
-        folder: where to write, made if missing; the odometry's results may be in ``NAME/odometry``.
+        folder: the folder to write to, made if missing; the odometry's results may be in ``NAME/odometry``.
         truths: true trajectory of each session, poses of body in any frame; or None.
 
     Raises:
@@ -55,7 +55,7 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
 
 
 def write_plan(found: Optimization, folder: Path, points: Float | None) -> None:
-    """Write a picture of the frame with most framesets from above, with points (N, 3) of its map.
+    """Write a picture from above of the frame with most framesets, with the points (N, 3) of its map unless None.
 
     Raises:
         OptimizationError: if the folder cannot be written.
@@ -67,7 +67,7 @@ def write_plan(found: Optimization, folder: Path, points: Float | None) -> None:
 
 
 def _largest_frames(numbers: Numbers) -> list[int]:
-    """Return the frames with most framesets, in order."""
+    """Return the frames with most framesets, `_MAX_MAPS` at most, in order of their numbers."""
     framesets = [0] * numbers.frames
     for part in numbers.parts:
         framesets[part.frame] += part.framesets

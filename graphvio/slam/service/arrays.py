@@ -1,4 +1,4 @@
-"""Arrays as lists of numbers in messages."""
+"""Conversion of arrays to and from lists of numbers in messages."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def packed(array: AnyArray | None) -> list[float]:
 
 
 def floats(values: Sequence[float], shape: tuple[int, ...], what: str) -> Float:
-    """Return an array of a shape from its values row by row; raises a ServiceError if their number is another."""
+    """Return an array of a shape from its values row by row; raises a ServiceError if their number does not fit."""
     _check_count(len(values), shape, what)
     return np.array(values, dtype=np.float64).reshape(shape)
 
 
 def maybe_floats(values: Sequence[float], shape: tuple[int, ...], what: str) -> Float | None:
-    """Return the same as `floats`, but None for an empty list."""
+    """Return an array as `floats` does, but None for an empty list."""
     return floats(values, shape, what) if len(values) else None
 
 

@@ -1,4 +1,4 @@
-"""The calls of the proto's service, from its descriptor: methods of a channel for clients, handlers for servers."""
+"""The calls of the proto's service, made from its descriptor: methods for clients, handlers for servers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SERVICE = messages.DESCRIPTOR.services_by_name["FrontEnd"]
 
 
 class Stub:
-    """The calls by name, such as ``GetInfo``, through a channel."""
+    """The service's calls through a channel as attributes, such as ``GetInfo``."""
 
     def __init__(self, channel: Any) -> None:
         for call in _SERVICE.methods:

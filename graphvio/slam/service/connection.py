@@ -1,4 +1,4 @@
-"""A client's connection: channel, token and calls; gRPC's failures become typed errors."""
+"""A client's connection to a server: channel, token and calls; gRPC's failures are raised as `ServiceError`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Connection:
         self.stub: Any = Stub(self._channel)
 
     def call(self, name: str, request: Any) -> Any:
-        """Return the server's answer to a request of a call, such as ``GetInfo``.
+        """Make a call, such as ``GetInfo``, and return the server's answer.
 
         Raises:
             ServiceError: If the call fails.
@@ -160,7 +160,7 @@ def _transport() -> list[tuple[str, int]]:
         ("grpc.max_reconnect_backoff_ms", 2_000),
         ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
         ("grpc.keepalive_timeout_ms", _PONG_MS),
-        ("grpc.http2.ping_timeout_ms", _PONG_MS),  # else any other ping in flight delays it to a minute
+        ("grpc.http2.ping_timeout_ms", _PONG_MS),  # else any other ping in flight delays this to a minute
         ("grpc.http2.max_pings_without_data", 0),
     ]
 
@@ -189,7 +189,7 @@ def _read_certificates(path: Path) -> bytes:
 
 
 def _why_unreachable(host: str, port: int, ca: bytes | None) -> str:
-    """Connect without gRPC, whose messages name no remedy, and return what is wrong and what to do."""
+    """Connect without gRPC, whose messages name no remedy, and return what is wrong and how to correct it."""
     try:
         with socket.create_connection((host, port), _DIAGNOSIS_S) as connection:
             return _why_no_service(connection, host, ca)

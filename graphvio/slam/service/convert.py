@@ -31,7 +31,7 @@ _INT64 = 2**63
 Value = float | int | str | None
 
 
-@functools.lru_cache(maxsize=4)  # many keyframes have the same one
+@functools.lru_cache(maxsize=4)  # many keyframes have the same rig
 def rig_text(rig: Rig) -> str:
     """Return the text of a ``rig.yaml`` without masks, which are files on the server's machine."""
     bare = rig.with_cameras(lambda camera: as_written(replace(camera, mask=None), camera.body_T_cam))
@@ -40,7 +40,7 @@ def rig_text(rig: Rig) -> str:
 
 @functools.lru_cache(maxsize=4)
 def rig_of(text: str, origin: str) -> Rig:
-    """Parse the rig that a server sent; equal texts give the same one.
+    """Parse the rig that a server sent; equal texts give the same object.
 
     Raises:
         RigError: If this version of graphvio cannot read it.

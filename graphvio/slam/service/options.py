@@ -58,7 +58,7 @@ class ServiceOptions:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host is a loopback address. Other names than ``localhost`` are not: they may be redefined."""
+    """Return whether a host is a loopback address; of names only ``localhost`` is, as others may be redefined."""
     if host == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""Tokens, certificates and checks of requests."""
+"""Security of the service: tokens, certificates and checks of requests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TOKEN = re.compile(r"[!-~]{16,4096}")
 
 
 def bearer(token: str) -> tuple[str, str]:
-    """Return the metadata of a client's calls."""
+    """Return the metadata that a client sends with its calls, as key and value."""
     return (TOKEN_KEY, f"Bearer {token}")
 
 
@@ -44,7 +44,7 @@ def read_token(path: str | Path) -> str:
 
 
 def server_credentials(options: ServiceOptions) -> Any | None:
-    """Return gRPC's credentials of a server with TLS, or None without TLS.
+    """Return gRPC's credentials for a server with TLS, or None without TLS.
 
     Raises:
         ServiceError: If certificate or key cannot be read, do not match, or the key is readable by all.
@@ -65,7 +65,7 @@ def server_credentials(options: ServiceOptions) -> Any | None:
 
 
 def token_interceptor(token: str) -> Any:
-    """Return an interceptor that refuses every call without the token, also of methods that do not exist."""
+    """Return an interceptor that refuses every call without the token, even of methods that do not exist."""
 
     def refuse(_: Any, context: Any) -> Any:
         return context.abort(grpc.StatusCode.UNAUTHENTICATED, "the token is missing or wrong")
@@ -86,8 +86,8 @@ def token_interceptor(token: str) -> Any:
 class MalformedInterceptor(grpc.ServerInterceptor):  # type: ignore[misc]
     """Answers INVALID_ARGUMENT to requests that cannot be parsed.
 
-    When a deserializer raises, grpcio answers, but keeps the stream (seen with 1.85): after a dozen such requests the
-    connection accepts no calls any more. So none raises here.
+    When a deserializer raises, grpcio answers, but keeps the stream open (seen with 1.85): after a dozen such requests,
+    the connection accepts no more calls. So the deserializers do not raise here.
     """
 
     def intercept_service(self, continuation: Callable[[Any], Any], details: Any) -> Any:

@@ -19,16 +19,16 @@ from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.security import MalformedInterceptor, read_token, server_credentials, token_interceptor
 from graphvio.slam.service.servicer import STREAMS_OF_A_CLIENT, Servicer, StreamLimit
 
-_CALL_THREADS = 8  # for calls other than streams
+_CALL_THREADS = 8  # threads for calls other than streams
 _MAX_WAITING_CALLS = 64
 _MAX_REQUEST_BYTES = 64 * 2**10
 _MAX_METADATA_BYTES = 16 * 2**10
 _HANDSHAKE_MS = 5_000
 _MAX_IDLE_MS = 300_000
 _MIN_PING_MS = 4_000
-READ_S = 60.0  # for clients to read the last messages of an odometry that has ended
-_STALLED_S = 5.0  # a stream without a message read for so long is considered stalled
-_CUT_S = 0.5  # for streams and calls to notice that the server stops
+READ_S = 60.0  # time for clients to read the last messages of an odometry that has ended
+_STALLED_S = 5.0  # if no message is read for this time, the streams count as stalled
+_CUT_S = 0.5  # time for streams and calls to notice that the server stops
 _POLL_S = 0.05
 
 
@@ -117,7 +117,9 @@ class GrpcServer:
         self._server, self._pool = server, pool
 
     def drain(self, timeout_s: float = READ_S) -> bool:
-        """Wait until clients have read the streams of an odometry that has ended, while any message is read within 5 s.
+        """Wait until clients have read the streams of an odometry that has ended, as long as messages are read.
+
+        The wait ends early if no message is read for 5 s.
 
         Returns:
             Whether all streams have been read to their end.
@@ -144,7 +146,7 @@ class GrpcServer:
 def _transport(options: ServiceOptions) -> list[tuple[str, int]]:
     keepalive_ms = int(1e3 * options.keepalive_s)
     return [
-        ("grpc.so_reuseport", 0),  # else a second server on the port would get half of the clients
+        ("grpc.so_reuseport", 0),  # otherwise a second server on the port would get half of the clients
         ("grpc.max_receive_message_length", _MAX_REQUEST_BYTES),
         ("grpc.max_send_message_length", -1),
         ("grpc.max_metadata_size", _MAX_METADATA_BYTES),
@@ -155,7 +157,7 @@ def _transport(options: ServiceOptions) -> list[tuple[str, int]]:
         ("grpc.max_connection_idle_ms", _MAX_IDLE_MS),
         ("grpc.keepalive_time_ms", keepalive_ms),
         ("grpc.keepalive_timeout_ms", keepalive_ms // 2),
-        ("grpc.http2.ping_timeout_ms", keepalive_ms // 2),  # else any other ping in flight delays it to a minute
+        ("grpc.http2.ping_timeout_ms", keepalive_ms // 2),  # else any other ping in flight delays this to a minute
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.max_pings_without_data", 0),
         ("grpc.http2.min_recv_ping_interval_without_data_ms", _MIN_PING_MS),
@@ -183,9 +185,9 @@ def _cannot_listen(options: ServiceOptions, reason: str) -> ServiceError:
 
 
 class DaemonPool(Executor):
-    """A `concurrent.futures.ThreadPoolExecutor` of daemon threads.
+    """A thread pool like `concurrent.futures.ThreadPoolExecutor`, but with daemon threads.
 
-    A program waits for the standard one's threads when it ends; with an open stream it would wait forever.
+    A program waits for the threads of the standard pool when it ends; with an open stream it would wait forever.
     """
 
     def __init__(self, max_threads: int) -> None:
@@ -221,7 +223,7 @@ class DaemonPool(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Accept no more work; submitted work is done. See `concurrent.futures.Executor.shutdown`."""
+        """Accept no more work; submitted work is still done. See `concurrent.futures.Executor.shutdown`."""
         with self._lock:
             self._is_shut = True
             for _ in self._threads:

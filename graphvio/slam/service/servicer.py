@@ -1,4 +1,4 @@
-"""The service's answers. Calls run in threads of the server's pool, never in the odometry's."""
+"""The service's implementation of the calls, which run in threads of the server's pool, never in the odometry's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graphvio.slam.service.arrays import floats, packed
 from graphvio.slam.service.options import RUN_KEY
 from graphvio.version import __version__
 
-_POLL_S = 0.25  # within which a stream notices that its client is gone or the server stops
+_POLL_S = 0.25  # time within which a stream notices that its client is gone or the server stops
 _MAX_WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
 _MAX_WAITING_EVENTS = 256
 STREAMS_OF_A_CLIENT = 4
@@ -31,15 +31,15 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Stream:
-    """An open stream."""
+    """An open stream of messages to a client."""
 
     client: str  # address of its client
-    # when its client last read a message, or opened it, by `time.monotonic`
+    # when the client last read a message, or opened the stream, by `time.monotonic`
     read_s: float = field(default_factory=time.monotonic)
 
 
 class StreamLimit:
-    """The open streams, whose number is limited by client and in total."""
+    """The open streams, whose number is limited per client, as is the number of clients with streams."""
 
     def __init__(self, max_clients: int) -> None:
         self._max_clients = max_clients
@@ -58,7 +58,11 @@ class StreamLimit:
             return any(stream.read_s > since_s for stream in self._streams)
 
     def enter(self, client: str) -> Stream:
-        """Add a stream of a client."""
+        """Add and return a stream of a client.
+
+        Raises:
+            ServiceError: if there are too many clients, or the client has too many streams.
+        """
         with self._lock:
             clients = {stream.client for stream in self._streams}
             if client not in clients and len(clients) >= self._max_clients:
@@ -78,7 +82,7 @@ class StreamLimit:
 
 
 class Servicer:
-    """Answers the calls to one odometry; ``stopping`` is set when streams must end though it continues."""
+    """Answers the calls for one odometry; ``stopping`` is set when streams must end although the odometry goes on."""
 
     def __init__(self, served: Served, run_id: str, limit: StreamLimit, stopping: threading.Event) -> None:
         self._served = served
@@ -129,7 +133,7 @@ class Servicer:
                 if keyframe is not None:
                     message = convert.keyframe_message(keyframe, request.with_images, request.with_descriptors)
                     yield messages.KeyframeUpdate(keyframe=message, gone=keyframe.id - next_id)
-                    stream.read_s = time.monotonic()  # asked for the next message: this one is sent
+                    stream.read_s = time.monotonic()  # gRPC asks for the next message: this one is sent
                     next_id = keyframe.id + 1
                 elif log.is_closed and log.next_id <= next_id:
                     return
@@ -207,7 +211,7 @@ class Servicer:
             )
 
     def _abort_if_stopping(self, read: KeyframeLog | BoundedQueue[Any], context: Any) -> None:
-        """End a stream of a running odometry; one of an odometry that has ended may be read to its end."""
+        """End a stream if the server stops; the stream of an odometry that has ended may be read to its end."""
         if self._stopping.is_set() and not read.is_closed:  # in this order: odometries end before their server
             context.abort(grpc.StatusCode.UNAVAILABLE, "the server stops")
 
