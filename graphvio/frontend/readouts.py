@@ -6,9 +6,12 @@ the measured motions, and the frameset's motion is measured again.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from graphvio.arrays import Bool, Float
+from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
 from graphvio.frontend.motion.observations import RigArrays, correspond
 from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
 from graphvio.frontend.references import References
@@ -21,6 +24,7 @@ from graphvio.measurements.motion import ByVelocities
 from graphvio.rig import Rig
 
 _UNKNOWN_SIGMA_M_S = 0.5
+_MIN_Z = 1e-3
 
 
 class Readouts:
@@ -70,7 +74,37 @@ class Readouts:
         references.read_out(seen.reference_stamp_ns, then, rig)
         self._applied[seen.reference_stamp_ns] = then
         reference = references.shared(frames)
+        for j, keyframe in reference.items():
+            trackers[j].read_out_keyframe(keyframe, then)
         return TrackedFrameset(seen.stamp_ns, seen.frozen, frames, reference, correspond(reference, frames), now)
+
+    def with_unknown_depths(self, seen: TrackedFrameset, arrays: RigArrays, cur_T_ref: Float) -> TrackedFrameset:
+        """Add the effect of unknown depths on the compensation to the covariances of single cameras' points.
+
+        While the depth of a point is unknown, its rays at both stamps are compensated with a wrong one.
+
+        Args:
+            seen: the tracks of the frameset.
+            arrays: the calibration of the rig.
+            cur_T_ref: (4, 4) predicted motion of body since the reference.
+        """
+        joined = seen.correspondences
+        covariances = joined.observations.covariances.copy()
+        for j in joined.singles:
+            frame, reference, rows = seen.frames[j], seen.reference[j], joined.rows[j]
+            then = np.searchsorted(reference.ids, frame.ids[rows])
+            of_pair = joined.observations.pair == j
+            slopes = _slopes_of_both(
+                joined.observations.points[of_pair],
+                reference.shutter_slopes[then],
+                frame.shutter_slopes[rows],
+                arrays.cam_T_body[j, 0] @ cur_T_ref @ arrays.body_T_left[j],
+            )
+            by_depth = np.tile(np.eye(3), (len(rows), 1, 1))
+            by_depth[:, :2, 2] = slopes
+            covariances[of_pair] = by_depth @ covariances[of_pair] @ by_depth.transpose(0, 2, 1)
+        observations = joined.observations._replace(covariances=covariances)
+        return seen._replace(correspondences=replace(joined, observations=observations))
 
     def errors(
         self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
@@ -103,6 +137,41 @@ class Readouts:
             then = np.searchsorted(reference.ids, frame.ids[rows])
             parts.append(self._line_s[j] * np.array([frame.pixels[rows, 1], reference.pixels[then, 1]]))
         return np.ascontiguousarray(np.hstack(parts))
+
+
+def _slopes_of_both(points: Float, then: Float, now: Float, cur_T_ref: Float) -> Float:
+    """Return by how much the rays of both framesets move against each other with the inverse depth, at the reference.
+
+    Args:
+        points: (N, 3) ``[x, y, 1/Z]`` at the reference.
+        then: (N, 2) derivatives of the rays at the reference with respect to the inverse depth then.
+        now: (N, 2) the same of the newest rays.
+        cur_T_ref: (4, 4) predicted motion of points in the camera.
+    """
+    turned = np.column_stack([points[:, :2], np.ones(len(points))]) @ cur_T_ref[:3, :3].T
+    turned += points[:, 2:] * cur_T_ref[:3, 3]
+    z = np.maximum(turned[:, 2:], _MIN_Z)
+    by_ray = (cur_T_ref[:2, :2] - (turned[:, :2] / z)[:, :, None] * cur_T_ref[2, :2]) / z[:, :, None]
+    return np.asarray(then - np.linalg.solve(by_ray, (now / z)[:, :, None])[:, :, 0])
+
+
+def readout_sigma_px(frame: TrackedFrame, reference: TrackedFrame | None, focal_px: float) -> Float:
+    """Return the error (N,) of the compensation by unknown depths, pixels, for a pixel noise of 1 px.
+
+    Args:
+        frame: the tracks of a single camera with a rolling shutter.
+        reference: its reference frame, where the depths of the tracks are known, or None.
+        focal_px: focal length, pixels per normalised image unit.
+
+    Returns:
+        Standard deviations (N,), infinite for tracks that the reference does not have.
+    """
+    sigma_px = np.full(len(frame.ids), np.inf)
+    if reference is not None:
+        now, then = common_rows(frame.ids, reference.ids)
+        slopes_px = focal_px * np.linalg.norm(frame.shutter_slopes[now], axis=1)
+        sigma_px[now] = slopes_px * np.sqrt(reference.covariances[then, 2, 2])
+    return sigma_px
 
 
 def is_velocity_known(readout: ReadoutMotion | None) -> bool:

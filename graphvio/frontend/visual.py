@@ -22,7 +22,7 @@ from graphvio.frontend.motion.refinement import Refined
 from graphvio.frontend.motion.selection import best_pair_motion, joint_motion
 from graphvio.frontend.pairs.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.pairs.pair_reports import inliers_of, pair_reports
-from graphvio.frontend.readouts import Readouts, is_velocity_known
+from graphvio.frontend.readouts import Readouts, is_velocity_known, readout_sigma_px
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracking_frontend import MotionPredictor, TrackedFrameset, TrackingFrontend
 from graphvio.geometry import se3_inverse, so3_log
@@ -30,6 +30,7 @@ from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 from graphvio.timing import timed
 
+_MAX_READOUT_SIGMA_PX = 0.2  # of tracks that the self-calibration uses
 _MIN_NOISE_SHARE = 0.5  # of the modelled noise, at least: the few corners before blank walls are not matched better
 
 
@@ -96,11 +97,25 @@ class VisualFrontend(TrackingFrontend):
         self._baselines_m = _baselines_m(rig)
         self._recalibrate(rig, epipolar_margin_px, uncertain)
 
+    def compensated_frames_at(self, stamp_ns: int) -> dict[int, TrackedFrame]:
+        """Return the tracks as `frames_at` does, without those whose rolling shutter is not compensated exactly.
+
+        These are tracks of single cameras, while their depths are hardly known.
+        """
+        frames = self.frames_at(stamp_ns)
+        if self._readouts is not None:
+            for j, frame in frames.items():
+                if frame.is_single and self._rig.groups[j].left.line_time_us:
+                    sigma_px = readout_sigma_px(frame, self._references.of(j), self._rig.groups[j].left.focal_px)
+                    frames[j] = frame.keep(sigma_px * self._config.motion.pixel_sigma_px < _MAX_READOUT_SIGMA_PX)
+        return frames
+
     # ------------------------------------------------------------------ one frameset
 
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset."""
         contradicted_ns = self._contradicted_ns
+        seen = self._with_unknown_depths(seen, motion_since)
         agreement, reason = self._estimate_motion(seen, motion_since)
         if self._readouts is not None:
             if agreement is not None:
@@ -157,6 +172,14 @@ class VisualFrontend(TrackingFrontend):
             return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"
         return agreement, ""
 
+    def _with_unknown_depths(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> TrackedFrameset:
+        """Add the effect of unknown depths on rolling shutters to the covariances of single cameras' points."""
+        if self._readouts is None or not seen.correspondences.singles:
+            return seen
+        predicted = motion_since(seen.reference_stamp_ns)
+        start = np.eye(4) if predicted is None else predicted
+        return self._readouts.with_unknown_depths(seen, self._extrinsics.arrays, start)
+
     def _with_shown_velocities(
         self,
         seen: TrackedFrameset,
@@ -174,6 +197,7 @@ class VisualFrontend(TrackingFrontend):
         again = readouts.compensated_by_motion(seen, self._trackers, self._references, self._rig)
         if again is None:
             return seen, agreement, ""
+        again = self._with_unknown_depths(again, motion_since)
         self._latest.update(again.frames)
         self._contradicted_ns = contradicted_ns
         better, reason = self._estimate_motion(again, motion_since)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
+from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.frontend.tracking_frontend import TrackingFrontend
 from graphvio.geometry import se3_inverse
 from graphvio.measurements.estimate import Estimate, Status
@@ -146,9 +147,9 @@ def keyframe_of(
     )
 
 
-def views_at(frontend: TrackingFrontend, stamp_ns: int) -> dict[int, View]:
-    """Return the views of pairs and single cameras, by index, at the newest frameset, if it has this stamp."""
+def views_of(frames: Mapping[int, TrackedFrame]) -> dict[int, View]:
+    """Return the views of pairs and single cameras, by index, of their tracks at one frameset."""
     return {
         j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_right, frame.points[:, 2])
-        for j, frame in frontend.frames_at(stamp_ns).items()
+        for j, frame in frames.items()
     }

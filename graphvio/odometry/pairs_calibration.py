@@ -16,7 +16,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import CORRECTED, EventKind, Report
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import ImuSample
-from graphvio.odometry.assembly import views_at
+from graphvio.odometry.assembly import views_of
 from graphvio.odometry.calibration_innovation_covariance import CalibrationInnovationCovariance
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
@@ -136,7 +136,7 @@ class PairsCalibration:
         is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
         if not (is_usable or is_urgent) or not self._frontend.are_velocities_known:
             return
-        views = views_at(self._frontend, stamp_ns)
+        views = views_of(self._frontend.compensated_frames_at(stamp_ns))
         tolerant = self._imu_fault_tolerant
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)

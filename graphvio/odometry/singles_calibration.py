@@ -13,7 +13,7 @@ from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
 from graphvio.monocular.estimator import MonocularEstimator
-from graphvio.odometry.assembly import views_at
+from graphvio.odometry.assembly import views_of
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.collector import FIRST_WINDOW_SIGMA_PX, WINDOW, FullWindow, WindowCollector
@@ -108,7 +108,7 @@ class SinglesCalibration:
             self._collector.restart()
         if status is not Status.TRACKING or not self._estimator.has_pose:  # a wrong clock may have ended the pose since
             return
-        views = views_at(self._frontend, stamp_ns)
+        views = views_of(self._frontend.frames_at(stamp_ns))
         if self._collector.is_keyframe(stamp_ns, views, _KEYFRAME_INTERVAL_S):
             self._collector.add(stamp_ns, self._estimator.state().nav_T_body, views)
 

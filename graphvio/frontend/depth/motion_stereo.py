@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.frontend.depth.tracks import common_rows
 from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.kernels import kernel
 from graphvio.rig import Camera
@@ -83,12 +84,16 @@ class MotionHistory:
 
 
 class FirstSights:
-    """First sights of one camera's tracks: their rays at the keyframes from which their depths are triangulated."""
+    """First sights of one camera's tracks: their rays at the keyframes from which their depths are triangulated.
+
+    Where a rolling shutter is compensated, a ray at the stamp is a linear function of the inverse depth.
+    """
 
     def __init__(self) -> None:
         self._ids: Int = np.zeros(0, dtype=np.int64)
         self._stamps_ns: Int = np.zeros(0, dtype=np.int64)
         self._rays: Float = np.zeros((0, 2))
+        self._slopes: Float = np.zeros((0, 2))
 
     def recalibrate(self, then: Camera, now: Camera) -> None:
         """Use another calibration of the camera, by which the same pixels have other normalised coordinates."""
@@ -96,25 +101,48 @@ class FirstSights:
         rays, has_ray = now.unproject(pixels)
         self._rays = np.where((is_seen & has_ray)[:, None], rays, self._rays)
 
+    def see_again(self, stamp_ns: int, ids: Int, rays: Float, slopes: Float) -> None:
+        """Replace rays and slopes (N, 2) of first sights at a keyframe, whose rolling shutter was compensated again.
+
+        Args:
+            stamp_ns: stamp of the keyframe.
+            ids: (N,) identities of its tracks, increasing.
+            rays: (N, 2) normalised coordinates of points at infinity.
+            slopes: (N, 2) derivatives of these with respect to the inverse depth.
+        """
+        own, rows = common_rows(self._ids, ids)
+        is_then = self._stamps_ns[own] == stamp_ns
+        self._rays[own[is_then]], self._slopes[own[is_then]] = rays[rows[is_then]], slopes[rows[is_then]]
+
     def locate(
-        self, ids: Int, rays: Float, history: MotionHistory, body_T_cam: Float, focal_px: float, sigma_px: float
+        self,
+        ids: Int,
+        rays: Float,
+        history: MotionHistory,
+        body_T_cam: Float,
+        focal_px: float,
+        sigma_px: float,
+        slopes: Float | None = None,
     ) -> tuple[Float, Float]:
         """Compute the points of a keyframe's tracks; for tracks without a first sight, this is the first one.
 
         Args:
             ids: (N,) identities of the tracks, increasing.
-            rays: (N, 2) their normalised coordinates.
+            rays: (N, 2) their normalised coordinates, with a rolling shutter those of points at infinity.
             history: motion history with this keyframe as the newest one.
             body_T_cam: (4, 4) pose of the camera.
             focal_px: focal length, pixels per normalised image unit.
             sigma_px: pixel noise.
+            slopes: (N, 2) derivatives of the rays with respect to the inverse depth, with a rolling shutter; None for
+                zero.
 
         Returns:
             Points (N, 3) ``[x, y, 1/Z]`` and their covariances (N, 3, 3) for a pixel noise of 1 px, in the form of
             `graphvio.frontend.depth.stereo.triangulate`.
         """
         assert history.newest_ns is not None
-        stamps_ns, first = self._of_tracks(ids, rays, history)
+        slopes = np.zeros_like(rays) if slopes is None else slopes
+        stamps_ns, first, first_slopes = self._of_tracks(ids, rays, slopes, history)
         instants, which = np.unique(stamps_ns, return_inverse=True)
         cam_T_body, since = se3_inverse(body_T_cam), [history.since(int(ns)) for ns in instants]
         adjoint = se3_adjoint(cam_T_body)
@@ -123,35 +151,40 @@ class FirstSights:
         motion = np.array([adjoint @ each.covariance @ adjoint.T for each in known]) / sigma_px**2
         drift = np.array([_DRIFT_PX2 * each.keyframes for each in known])
         points, covariances, fits = _locate(
-            rays, first, which, then_T_now.reshape(-1, 4, 4), motion.reshape(-1, 6, 6), drift, 1.0 / focal_px**2,
-            (_PRIOR_SIGMA / sigma_px) ** 2, _MAX_DISTANCE * sigma_px**2,
+            rays, slopes, first, first_slopes, which, then_T_now.reshape(-1, 4, 4), motion.reshape(-1, 6, 6), drift,
+            1.0 / focal_px**2, (_PRIOR_SIGMA / sigma_px) ** 2, _MAX_DISTANCE * sigma_px**2,
         )  # fmt: skip
         self._ids, self._rays = ids, np.where(fits[:, None], first, rays)
+        self._slopes = np.where(fits[:, None], first_slopes, slopes)
         self._stamps_ns = np.where(fits, stamps_ns, history.newest_ns)
         return points, covariances
 
-    def _of_tracks(self, ids: Int, rays: Float, history: MotionHistory) -> tuple[Int, Float]:
-        """Return stamps (N,) and rays (N, 2) of the tracks' first sights: those of this keyframe if there is none."""
-        stamps_ns, first = np.full(len(ids), history.newest_ns, dtype=np.int64), rays.copy()
+    def _of_tracks(self, ids: Int, rays: Float, slopes: Float, history: MotionHistory) -> tuple[Int, Float, Float]:
+        """Return stamps (N,), rays and slopes (N, 2) of the tracks' first sights: this keyframe's if there is none."""
+        stamps_ns = np.full(len(ids), history.newest_ns, dtype=np.int64)
+        first, first_slopes = rays.copy(), slopes.copy()
         if len(self._ids):
             rows = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
             reached = {int(ns): history.since(int(ns)) is not None for ns in np.unique(self._stamps_ns)}
             is_known = np.array([reached[int(ns)] for ns in self._stamps_ns[rows]], dtype=bool)
             has = (self._ids[rows] == ids) & is_known
             stamps_ns[has], first[has] = self._stamps_ns[rows[has]], self._rays[rows[has]]
-        return stamps_ns, first
+            first_slopes[has] = self._slopes[rows[has]]
+        return stamps_ns, first, first_slopes
 
 
 @kernel
 def _locate(
-    rays: Float, first: Float, which: Int, then_T_now: Float, motion: Float, drift: Float, pixel: float,
-    prior: float, max_distance: float,
+    rays: Float, slopes: Float, first: Float, first_slopes: Float, which: Int, then_T_now: Float, motion: Float,
+    drift: Float, pixel: float, prior: float, max_distance: float,
 ) -> tuple[Float, Float, Bool]:  # fmt: skip
     """Compute points (N, 3), covariances (N, 3, 3), and which of them (N,) fit the motion; the others have the prior.
 
     Args:
-        rays: (N, 2) normalised coordinates now.
-        first: (N, 2) normalised coordinates at the tracks' first sights.
+        rays: (N, 2) normalised coordinates now, of points at infinity.
+        slopes: (N, 2) derivatives of these with respect to the inverse depth.
+        first: (N, 2) normalised coordinates at the tracks' first sights, of points at infinity.
+        first_slopes: (N, 2) derivatives of these with respect to the inverse depth then.
         which: (N,) index of the instant of each track's first sight, among A instants.
         then_T_now: (A, 4, 4) pose of the camera now, in the camera's frame at each instant.
         motion: (A, 6, 6) covariance of the motion since then, in the camera's frame now, for a pixel noise of 1 px.
@@ -165,7 +198,8 @@ def _locate(
     by_ray, by_motion = np.empty((2, 2)), np.empty((2, 6))
     for i in range(n):
         m, c = then_T_now[which[i]], motion[which[i]]
-        x, y, w = rays[i, 0], rays[i, 1], PRIOR_INVERSE_DEPTH
+        w = PRIOR_INVERSE_DEPTH
+        x, y = rays[i, 0] + w * slopes[i, 0], rays[i, 1] + w * slopes[i, 1]
         variance, gain_x, gain_y, e2 = prior, 0.0, 0.0, 0.0
         for _ in range(_STEPS):
             z = max(m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3], _MIN_DEPTH_RATIO)
@@ -183,7 +217,12 @@ def _locate(
                 by_motion[r, 0] = g1 - g2 * y
                 by_motion[r, 1] = g2 * x - g0
                 by_motion[r, 2] = g0 * y - g1 * x
-            j0, j1 = (m[0, 3] - u * m[2, 3]) / z, (m[1, 3] - v * m[2, 3]) / z
+            # Of the predicted ray less the one that was seen, which both depend on the inverse depth.
+            then = (1.0 - w / z * (m[2, 3] + m[2, 0] * slopes[i, 0] + m[2, 1] * slopes[i, 1])) / z
+            j0 = (m[0, 3] - u * m[2, 3]) / z
+            j0 += by_ray[0, 0] * slopes[i, 0] + by_ray[0, 1] * slopes[i, 1] - then * first_slopes[i, 0]
+            j1 = (m[1, 3] - v * m[2, 3]) / z
+            j1 += by_ray[1, 0] * slopes[i, 0] + by_ray[1, 1] * slopes[i, 1] - then * first_slopes[i, 1]
             own = pixel * (1.0 + drift[which[i]])
             s00 = own + pixel * (by_ray[0, 0] ** 2 + by_ray[0, 1] ** 2)
             s11 = own + pixel * (by_ray[1, 0] ** 2 + by_ray[1, 1] ** 2)
@@ -194,7 +233,7 @@ def _locate(
                     s01 += by_motion[0, p] * c[p, q] * by_motion[1, q]
                     s11 += by_motion[1, p] * c[p, q] * by_motion[1, q]
             det = s00 * s11 - s01 * s01
-            r0, r1 = first[i, 0] - u, first[i, 1] - v
+            r0, r1 = first[i, 0] + w / z * first_slopes[i, 0] - u, first[i, 1] + w / z * first_slopes[i, 1] - v
             # J^T S^-1
             k0, k1 = (j0 * s11 - j1 * s01) / det, (j1 * s00 - j0 * s01) / det
             variance = 1.0 / (k0 * j0 + k1 * j1 + 1.0 / prior)
@@ -202,9 +241,11 @@ def _locate(
             gain_y = -variance * (k0 * by_ray[0, 1] + k1 * by_ray[1, 1])
             e2 = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / det
             w += variance * (k0 * r0 + k1 * r1 + (PRIOR_INVERSE_DEPTH - w) / prior)
+            x, y = rays[i, 0] + w * slopes[i, 0], rays[i, 1] + w * slopes[i, 1]
         # Where the motion is hardly known, rounding may make S indefinite, and variances negative.
         if not (0.0 <= e2 < max_distance and w >= -3.0 * np.sqrt(variance)):
             fits[i], w, variance, gain_x, gain_y = False, PRIOR_INVERSE_DEPTH, prior, 0.0, 0.0
+            x, y = rays[i, 0] + w * slopes[i, 0], rays[i, 1] + w * slopes[i, 1]
         points[i, 0], points[i, 1], points[i, 2] = x, y, w
         covariances[i, 0, 0] = covariances[i, 1, 1] = pixel
         covariances[i, 0, 2] = covariances[i, 2, 0] = pixel * gain_x

@@ -40,6 +40,8 @@ class TrackedFrame:
         shutter_px: (N, 2, 2) offsets from the pixels in the left and in the right image to where a global shutter would
             have seen the points at the stamp; normalised coordinates and points are those at the offset pixels. Zero if
             not given.
+        shutter_slopes: (N, 2) derivatives of a single camera's ``left_rays`` with respect to the inverse depth, by
+            the compensation of its rolling shutter. Zero if not given.
     """
 
     stamp_ns: int
@@ -58,10 +60,13 @@ class TrackedFrame:
     rejected: Mapping[str, int] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
     shutter_px: Float = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    shutter_slopes: Float = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         if len(self.shutter_px) != len(self.ids):
             object.__setattr__(self, "shutter_px", np.zeros((len(self.ids), 2, 2)))
+        if len(self.shutter_slopes) != len(self.ids):
+            object.__setattr__(self, "shutter_slopes", np.zeros((len(self.ids), 2)))
 
     @property
     def pixels_at_stamp(self) -> Float:

@@ -15,7 +15,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.motion.depth_scale import with_scale_of_depths, with_unknown_scales
-from graphvio.frontend.motion.observations import Observations, RigArrays
+from graphvio.frontend.motion.observations import Observations, RigArrays, is_depth_known
 from graphvio.frontend.motion.ransac import search
 from graphvio.frontend.motion.refinement import Refined, refine
 from graphvio.frontend.pairs.extrinsic_monitor import combined, placed
@@ -215,12 +215,14 @@ def _second_motion(
 ) -> MotionHypothesis | None:
     """Find one more rigid motion that most of the unexplained points follow, or return None.
 
-    It may be the motion relative to the world, or relative to an object that moves.
+    It may be the motion relative to the world, or relative to an object that moves. Points of unknown depth do not
+    count: nearly any motion explains them.
     """
     errors_px = np.fmin.reduce([each.refined.errors_px for each in hypotheses])
-    unlike = ~(errors_px < _T.min_unlike_px)
+    testable = is_depth_known(rig, observations, config.pixel_sigma_px)
+    unlike = testable & ~(errors_px < _T.min_unlike_px)
     unexplained = unlike & ~np.any([each.refined.inlier for each in hypotheses], axis=0)
-    if unexplained.sum() < max(_T.min_rival_points, _T.min_unexplained_share * len(unexplained)):
+    if unexplained.sum() < max(_T.min_rival_points, _T.min_unexplained_share * testable.sum()):
         return None
     seen = observations.of_rows(unexplained)
     refined = refine(rig, seen, search(rig, seen, hypotheses[0].refined.cur_T_ref, config, rng), config)

@@ -127,6 +127,25 @@ def turned_rays(camera: Camera, pixels: Float, motion: ReadoutMotion) -> tuple[F
     return _turned(rays, 1e-6 * camera.line_time_us * pixels[:, 1], *_columns(by_force), camera.body_T_cam)
 
 
+def rays_by_depth(camera: Camera, pixels: Float, motion: ReadoutMotion) -> tuple[Float, Float]:
+    """Return the rays at which a global shutter would have seen points at the stamp, for any depth.
+
+    Args:
+        camera: camera with a rolling shutter.
+        pixels: (N, 2) as seen.
+        motion: motion of body during the readout.
+
+    Returns:
+        Normalised coordinates (N, 2) of points at infinity, and their derivatives (N, 2) with respect to the inverse
+        depth at the stamp, of which they are linear functions.
+    """
+    rays, _ = camera.unproject(pixels)
+    times_s = 1e-6 * camera.line_time_us * pixels[:, 1]
+    turned, readout = _turned(rays, times_s, *_columns(motion), camera.body_T_cam)
+    shifts = readout[:, 1:] @ camera.body_T_cam[:3, :3]
+    return turned, shifts[:, :2] - shifts[:, 2:] * turned
+
+
 def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) -> TrackedFrame:
     """Return a frame with rays and points as global shutters would have seen them at the stamp; its pixels stay.
 
@@ -142,8 +161,9 @@ def as_at_stamp(frame: TrackedFrame, group: CameraGroup, motion: ReadoutMotion) 
     shutter_px[:, 0] = left_px - frame.pixels
     if isinstance(group, SingleCamera):
         left, _ = group.left.unproject(left_px)
-        depths_then = frame.points[:, 2] if was_at_stamp else depths_then
-        return replace(frame, left_rays=left, points=np.column_stack([left, depths_then]), shutter_px=shutter_px)
+        _, slopes = rays_by_depth(group.left, frame.pixels, motion)
+        points = np.column_stack([left, frame.points[:, 2] if was_at_stamp else depths_then])
+        return replace(frame, left_rays=left, points=points, shutter_px=shutter_px, shutter_slopes=slopes)
     right_T_left = group.right_T_left
     z = np.column_stack([frame.left_rays, np.ones(len(depths))]) @ right_T_left[2, :3] + depths * right_T_left[2, 3]
     right_px, _ = pixels_at_stamp(group.right, frame.right_pixels, depths / np.maximum(z, _MIN_Z), motion)

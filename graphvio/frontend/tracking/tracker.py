@@ -18,7 +18,7 @@ from graphvio.frontend.imaging.images import ImageMask, UsablePixels
 from graphvio.frontend.imaging.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.tracking.keyframe_patches import KeyframePatches
 from graphvio.frontend.tracking.lost_tracks import image_shift, motion_of_found
-from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines, rays_by_depth
 from graphvio.rig import CameraGroup, StereoPair
 from graphvio.timing import Stopwatch
 
@@ -145,12 +145,19 @@ class GroupTracker:
         watch.lap("stereo")
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         if self._matcher is None and self._history.newest_ns == self._last.stamp_ns:
-            points, covariances = self._first_sights.locate(
-                self._last.ids, self._last.left_rays, self._history, self._body_T_left, self._group.left.focal_px,
-                self._config.motion.pixel_sigma_px,
-            )  # fmt: skip
-            self._last = replace(self._last, points=points, covariances=covariances)
+            self._last = self._located(self._last)
         return self._last
+
+    def _located(self, frame: TrackedFrame) -> TrackedFrame:
+        """Return a keyframe of a single camera with the points of its tracks by the motion since their first sights."""
+        rays, slopes, sigma_px = frame.left_rays, None, self._config.motion.pixel_sigma_px
+        if self._readout is not None:
+            rays, slopes = rays_by_depth(self._group.left, frame.pixels, self._readout)
+        points, covariances = self._first_sights.locate(
+            frame.ids, rays, self._history, self._body_T_left, self._group.left.focal_px, sigma_px, slopes
+        )
+        frame = replace(frame, points=points, covariances=covariances)
+        return frame if self._readout is None else as_at_stamp(frame, self._group, self._readout)
 
     def adopt(self, pixels: Float, inverse_depths: Float) -> tuple[TrackedFrame, Int]:
         """Begin tracks at given points of a single camera's newest image, where it has no track near.
@@ -388,6 +395,12 @@ class GroupTracker:
         if self._group.left.line_time_us:
             self._readout, self._last = readout, as_at_stamp(self._last, self._group, readout)
         return self._last
+
+    def read_out_keyframe(self, keyframe: TrackedFrame, readout: ReadoutMotion) -> None:
+        """Compensate the first sights of a single camera's tracks at a keyframe again, by another motion of body."""
+        if self._matcher is None and self._group.left.line_time_us:
+            rays, slopes = rays_by_depth(self._group.left, keyframe.pixels, readout)
+            self._first_sights.see_again(keyframe.stamp_ns, keyframe.ids, rays, slopes)
 
     @property
     def _min_gradient(self) -> float:
