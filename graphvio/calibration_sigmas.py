@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.errors import RigError
 
 _MARGIN_SIGMAS = 3.0
-_MAX_MARGIN_PX = 5.0  # beyond this, patches are not registered
+_MAX_MARGIN_PX = 5.0  # patches farther off than this are not registered
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class CalibrationSigmas:
         time_offset_s: standard deviation of the IMU's time offset.
         imu_scale_share: standard deviation of the scale of each axis of gyro and accelerometer.
         imu_misalignment_deg: standard deviation of the direction of each axis of gyro and accelerometer.
-        estimated: whether they come from an estimation of the calibration. Errors then are as large as these standard
-            deviations say, and the rig is never pinned as exact; one with typical standard deviations may be.
+        estimated: whether the values were estimated together with the calibration. They then describe its actual
+            errors, and the calibration is never pinned as exact; one with typical standard deviations may be.
 
     Raises:
         RigError: if a value is not positive and finite.
@@ -61,11 +61,11 @@ class CalibrationSigmas:
         return {name: value for name, value in vars(self).items() if name != "estimated"}
 
     def epipolar_margin_px(self, focal_px: float, rotation_deg: float) -> float:
-        """Return the possible error of epipolar lines near the middle of the image: 3 sigma, but no more than 5 px.
+        """Return the possible error of epipolar lines near the middle of the image, pixels: 3 sigma, but at most 5 px.
 
         Args:
-            focal_px: focal length of the cameras, px.
-            rotation_deg: standard deviation of their rotation to each other.
+            focal_px: focal length of the cameras, pixels.
+            rotation_deg: standard deviation of the rotation between the cameras, degrees.
         """
         turned_px = np.deg2rad(rotation_deg) * focal_px
         sigma_px = float(np.hypot(turned_px, np.sqrt(2.0) * self.principal_point_px))
@@ -80,4 +80,4 @@ class CalibrationSigmas:
 
 FACTORY = CalibrationSigmas()
 LEVELS = {"kalibr": FACTORY.scaled(0.3), "factory": FACTORY, "cad": FACTORY.scaled(5.0)}
-"""Levels by name: a careful calibration with a target, a factory calibration some months ago, CAD drawings."""
+"""Levels by name: a careful calibration with a target, a factory calibration some months old, and CAD drawings."""

@@ -1,4 +1,4 @@
-"""Camera models: what a lens does to the image of a point, and its inverse.
+"""Lens models: kernels that map normalised image coordinates to distorted ones and pixels, and back.
 
 Frame ``cam``: x right, y down, z forward; pixel (0, 0) is the centre of the upper left pixel. A model is given
 by its number, ``intrinsics`` (4,) ``[fx, fy, cx, cy]`` in pixels and ``distortion`` (8,), the coefficients of
@@ -15,8 +15,9 @@ the model could represent. Distorted coordinates are those that ``intrinsics`` m
 - ``omnidirectional``: C. Mei and P. Rives, *Single view point omnidirectional camera calibration from planar grids*,
   2007: the unified model, then radial-tangential distortion.
 
-The last three are one formula here. A point is projected to the unit sphere, or with `beta` to an ellipsoid; its
-centre is moved by `xi`, and the result is projected again from a place that `alpha` gives.
+The last three share one formula here, and are called sphere models: a point is projected to the unit sphere, shifted
+along the axis by `xi`, projected to a second sphere, or with `beta` to an ellipsoid, and from there to the image plane
+from a centre that `alpha` sets.
 """
 
 import numpy as np
@@ -24,8 +25,8 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.kernels import kernel
 
-# The order matters: models below DOUBLE_SPHERE are polynomials (of a point in the plane, or of its angle) or their
-# ratios, those from it on project through a sphere. A new polynomial model must be numbered below DOUBLE_SPHERE.
+# The order matters: models below DOUBLE_SPHERE are polynomials (of a point in the plane, or of its angle) or ratios of
+# them; from DOUBLE_SPHERE on they are sphere models. A new polynomial model must be numbered below DOUBLE_SPHERE.
 RADIAL_TANGENTIAL = 0
 EQUIDISTANT = 1
 RATIONAL = 2
@@ -42,7 +43,7 @@ MODEL_NAMES = {
 }
 
 N_COEFFICIENTS = 8
-"""Length of all arrays of coefficients."""
+"""Length of the array ``distortion`` of every model."""
 COEFFICIENTS = {
     "radial-tangential": ("k1", "k2", "p1", "p2", "k3"),
     "equidistant": ("k1", "k2", "k3", "k4"),
@@ -53,7 +54,7 @@ COEFFICIENTS = {
 }
 """Coefficients of each model, in the order of ``distortion``."""
 N_ESTIMATED = 5
-"""Number of coefficients, the first ones, that the self-calibration estimates; it keeps those of a denominator."""
+"""The self-calibration estimates at most this many coefficients, the first ones; those of a denominator stay fixed."""
 
 MAX_ANGLE_RAD = np.deg2rad(80.0)
 _MAX_TAN = float(np.tan(MAX_ANGLE_RAD))
@@ -69,8 +70,8 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
     """Compute the distorted normalised coordinates of (x, y), and their Jacobian (2, 2).
 
     Returns:
-        ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``; outside the model's domain, (x, y) with the
-        Jacobian ``-I``, which marks them as invalid.
+        ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``; outside the domain of a rational or sphere model, (x, y) with
+        the Jacobian ``-I``, which marks the result as invalid.
     """
     if model == EQUIDISTANT:
         r2 = x * x + y * y
@@ -100,9 +101,9 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
 
 @kernel
 def _polynomial(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """Apply radial and tangential distortion, with their denominator for ``rational``; returns as `distort` does.
+    """Apply radial and tangential distortion, with a denominator for ``rational``; returns the same as `distort`.
 
-    For ``radial-tangential`` the denominator is 1 exactly, and nothing is rounded by it.
+    The other models are computed without a division, and so without its rounding.
     """
     first = 1 if model == OMNIDIRECTIONAL else 0
     k1, k2, p1, p2 = distortion[first], distortion[first + 1], distortion[first + 2], distortion[first + 3]
@@ -142,10 +143,10 @@ def _sphere_shape(model: int, distortion: Float) -> tuple[float, float, float]:
 
 @kernel
 def _sphere(model: int, distortion: Float, x: float, y: float) -> tuple[float, float]:
-    """Compute by what a sphere model scales (x, y), and ``(d scale / d r) / r``; 0 outside the model's domain.
+    """Compute the factor by which a sphere model scales (x, y), and ``(d scale / d r) / r``; 0 outside the domain.
 
-    The domain is that of Usenko et al., (43) to (45), before its approximation to first order in xi: what is left of
-    the unified model's own, ``z > -w d``, at the second sphere.
+    The domain is that of Usenko et al., (43) to (45), without their approximation to first order in xi: the domain
+    ``z > -w d`` of the unified model, applied at the second sphere.
     """
     xi, alpha, beta = _sphere_shape(model, distortion)
     r2 = x * x + y * y
@@ -162,9 +163,9 @@ def _sphere(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
 
 @kernel
 def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float:
-    """Compute derivatives (5, 2) of the distorted coordinates of (x, y) with respect to the first coefficients.
+    """Compute derivatives (5, 2) of the distorted coordinates of (x, y) with respect to the first five coefficients.
 
-    Zero for those that a model does not have, and outside its domain.
+    They are zero for coefficients that the model does not have, and outside the domain of a sphere model.
     """
     basis = np.zeros((N_ESTIMATED, 2))
     if model == EQUIDISTANT:
@@ -218,7 +219,7 @@ def _sphere_derivatives(model: int, distortion: Float, x: float, y: float) -> tu
 
 @kernel
 def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, bool]:
-    """Find the normalised coordinates whose distortion is (xd, yd); False where there are none within 80 degrees."""
+    """Find the normalised coordinates whose distorted ones are (xd, yd); False if there are none within 80 degrees."""
     if model == EQUIDISTANT:
         theta_d = np.sqrt(xd * xd + yd * yd)
         if theta_d < 1e-8:
@@ -248,10 +249,10 @@ def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[floa
 def ray_of(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, float, bool]:
     """Find the direction whose distorted coordinates are (xd, yd), at any angle; not for ``equidistant``.
 
-    Polynomials are inverted by Newton's method, spheres in closed form: Usenko et al., (46) to (50).
+    Polynomials are inverted by Newton's method, sphere models in closed form: Usenko et al., (46) to (50).
 
     Returns:
-        ``(x, y, z)`` of any length, and whether there is one.
+        The direction ``(x, y, z)``, not normalised, and whether there is one.
     """
     x, y, converged = xd, yd, True
     if model < DOUBLE_SPHERE or model == OMNIDIRECTIONAL:
@@ -277,7 +278,7 @@ def ray_of(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, 
 def fold_radius(model: int, distortion: Float) -> float:
     """Find the normalised radius from which distortion maps outer points inwards again, at most tan(80 degrees).
 
-    It ends there for a model whose domain is less than that.
+    For a model with a smaller domain it is the radius of the domain, where `distort` returns a negative slope.
     """
     radius = 0.0
     while radius < _MAX_TAN:
@@ -295,7 +296,7 @@ def _inverse_polynomial(model: int, distortion: Float, xd: float, yd: float) -> 
     """Invert `_polynomial` by Newton's method; False where it does not converge."""
     x, y = xd, yd
     for attempt in range(2 if model == RATIONAL else 1):
-        if attempt == 1:  # a quotient bends so much that the method may leave the domain, or go to and fro
+        if attempt == 1:  # a ratio of polynomials may be so curved that Newton's method leaves the domain or oscillates
             x, y = _within_fold(model, distortion, xd, yd)
         x, y, found = _newton(model, distortion, xd, yd, x, y)
         if found and (model != RATIONAL or _is_before_fold(model, distortion, x, y)):
@@ -305,7 +306,7 @@ def _inverse_polynomial(model: int, distortion: Float, xd: float, yd: float) -> 
 
 @kernel
 def _is_before_fold(model: int, distortion: Float, x: float, y: float) -> bool:
-    """Check at some points between the axis and (x, y) that distortion does not map outer points inwards."""
+    """Return whether distortion maps outer points outwards at 7 points between the axis and (x, y)."""
     for i in range(1, _CHECKS):
         share = i / _CHECKS
         _, _, a, b, c, d = _polynomial(model, distortion, share * x, share * y)
@@ -316,7 +317,7 @@ def _is_before_fold(model: int, distortion: Float, x: float, y: float) -> bool:
 
 @kernel
 def _within_fold(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float]:
-    """Bisect for the point on the ray to (xd, yd), within the fold, that is distorted as far out."""
+    """Find by bisection the point towards (xd, yd), within the fold radius, that is distorted to the same radius."""
     distance, inner, outer = np.sqrt(xd * xd + yd * yd), 0.0, fold_radius(model, distortion)
     for _ in range(_BISECTIONS):
         radius = 0.5 * (inner + outer)
@@ -330,7 +331,7 @@ def _within_fold(model: int, distortion: Float, xd: float, yd: float) -> tuple[f
 
 @kernel
 def _newton(model: int, distortion: Float, xd: float, yd: float, x: float, y: float) -> tuple[float, float, bool]:
-    """Invert `_polynomial` by Newton's method from (x, y)."""
+    """Invert `_polynomial` by Newton's method, beginning at (x, y)."""
     u, v, is_close = xd, yd, False
     a, b, c, d = 1.0, 0.0, 0.0, 1.0
     steps = _NEWTON_STEPS if model == RADIAL_TANGENTIAL else _MORE_STEPS
@@ -338,7 +339,7 @@ def _newton(model: int, distortion: Float, xd: float, yd: float, x: float, y: fl
         u, v, a, b, c, d = _polynomial(model, distortion, x, y)
         if is_close or i == steps:
             break
-        if model == RATIONAL and a == -1.0:  # beyond a pole
+        if model == RATIONAL and a == -1.0:  # outside the domain, beyond a pole of the ratio
             x, y = 0.5 * x, 0.5 * y
             continue
         ex, ey = u - xd, v - yd
@@ -348,7 +349,7 @@ def _newton(model: int, distortion: Float, xd: float, yd: float, x: float, y: fl
         x -= step_x
         y -= step_y
         is_close = abs(step_x) + abs(step_y) < _NEWTON_TOLERANCE
-    # Beyond the radius where distortion folds back, Newton lands on a point whose Jacobian is not positive.
+    # For pixels beyond the fold radius, Newton's method ends at a point whose Jacobian is not positive.
     return x, y, abs(u - xd) + abs(v - yd) < 1e-8 and a * d - b * c > 0.0 and a > 0.0
 
 
@@ -357,9 +358,9 @@ def project_points(model: int, intrinsics: Float, distortion: Float, points: Flo
     """Project points to pixels.
 
     Args:
-        model: number of the model.
+        model: number of the lens model.
         intrinsics: (4,) pixels.
-        distortion: (8,).
+        distortion: coefficients (8,).
         points: (N, 3) metres, frame cam.
 
     Returns:
@@ -399,5 +400,5 @@ def unproject_pixels(model: int, intrinsics: Float, distortion: Float, pixels: F
 
 
 def central_scale(model: int, distortion: Float) -> float:
-    """Return by what the lens scales normalised coordinates around the optical axis, tangential distortion aside."""
+    """Return by what factor the lens scales normalised coordinates at the optical axis, without tangential terms."""
     return 1.0 / (1.0 + float(distortion[0])) if model in (DOUBLE_SPHERE, OMNIDIRECTIONAL) else 1.0

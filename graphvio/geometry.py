@@ -1,4 +1,4 @@
-"""SO(3) and SE(3): exponential, logarithm, adjoint, Jacobians, quaternions.
+"""Functions on SO(3) and SE(3): exponential, logarithm, adjoint, Jacobians, quaternions.
 
 A transform ``a_T_b`` is a 4x4 float64 array that maps coordinates, ``X_a = a_T_b X_b``; chains are products,
 ``a_T_c = a_T_b @ b_T_c``. The tangent is ordered ``[rotation(3), translation(3)]`` and perturbs on the right
@@ -28,7 +28,7 @@ def skew(v: Float) -> Float:
 
 @kernel
 def multiply(a: Float, b: Float) -> Float:
-    """Multiply two matrices (3, 3). In a kernel it is faster than ``@``, which calls a library for large matrices."""
+    """Multiply two matrices (3, 3); in a kernel faster than ``@``, which calls a library made for large matrices."""
     product = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -176,7 +176,7 @@ def se3(rotation: Float, translation: Float) -> Float:
 
 @kernel
 def se3_inverse(a_T_b: Float) -> Float:
-    """Invert a transform (4, 4): ``b_T_a``."""
+    """Return the inverse ``b_T_a`` (4, 4) of a transform."""
     inverse = np.eye(4)
     for i in range(3):
         for j in range(3):
@@ -188,9 +188,9 @@ def se3_inverse(a_T_b: Float) -> Float:
 
 @kernel
 def se3_compose(a_T_b: Float, b_T_c: Float) -> Float:
-    """Multiply two transforms (4, 4): ``a_T_c``.
+    """Return the product ``a_T_c`` (4, 4) of two transforms.
 
-    See `multiply`.
+    In a kernel it is faster than ``@``, see `multiply`.
     """
     a, b = a_T_b, b_T_c
     product = np.zeros((4, 4))
@@ -270,7 +270,7 @@ def _left_coupling(phi: Float, rho: Float) -> Float:
 
 @kernel
 def interpolate(a_T_b0: Float, a_T_b1: Float, fraction: float) -> Float:
-    """Interpolate between two poses (4, 4): position on the chord, rotation at a constant rate; fraction 0 to 1."""
+    """Interpolate between two poses (4, 4), position linearly and rotation at a constant rate; fraction 0 to 1."""
     R_0, R_1 = np.ascontiguousarray(a_T_b0[:3, :3]), np.ascontiguousarray(a_T_b1[:3, :3])
     return se3(
         R_0 @ so3_exp(fraction * so3_log(R_0.T @ R_1)), (1.0 - fraction) * a_T_b0[:3, 3] + fraction * a_T_b1[:3, 3]

@@ -159,7 +159,7 @@ def test_unknown_depths_are_in_the_covariance_of_points() -> None:
         covariances = by_point @ observations.covariances @ by_point.transpose(0, 2, 1)
         covariances += np.eye(2) / CAMERA.focal_px**2
         errors = observations.left - predicted
-        return np.einsum("ni,nij,nj->n", errors, np.linalg.inv(SIGMA_PX**2 * covariances), errors)
+        return np.asarray(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(SIGMA_PX**2 * covariances), errors))
 
     assert np.median(distances(frameset.correspondences.observations)) > 1.0
     assert np.median(distances(allowed)) < 0.1

@@ -321,6 +321,12 @@ def test_base_link_looks_ahead_with_axes_of_the_imu(turn: list[float]) -> None:
     np.testing.assert_allclose(frames.base_T_body, old_T_new, atol=1e-12)
 
 
+def test_base_link_of_a_rig_without_pairs_is_by_the_first_camera() -> None:
+    rig = small_rig()
+    alone = Frames.of_rig(rig.without_pairs())
+    np.testing.assert_array_equal(alone.base_T_body, Frames.of_rig(rig).base_T_body)
+
+
 @pytest.mark.parametrize(
     ("camera", "frame"),
     [

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from graphvio.arrays import Float
 from graphvio.cli.simulate import simulate as simulate_command
 from graphvio.errors import SourceError
+from graphvio.geometry import so3_log
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig
 from graphvio.simulation import (
@@ -269,6 +270,16 @@ def test_knock_in_the_middle_moves_the_first_pair_alone() -> None:
     assert np.linalg.norm(found["cameras_in_body_mm"]) == pytest.approx(5.0)
     np.testing.assert_allclose(found["cameras_in_body_deg"], 0.0, atol=1e-9)
     np.testing.assert_allclose(found["baseline_percent"], 0.0, atol=1e-9)
+
+
+def test_knock_of_a_rig_without_pairs_moves_the_first_camera_alone() -> None:
+    rig = default_rig().without_pairs()
+    knocked = RIG_CHANGES["knock"].rig_in(rig, 1)
+    assert all(one is other for one, other in zip(knocked.singles[1:], rig.singles[1:], strict=True))
+    was, now = (each.cameras[0].body_T_cam for each in (rig, knocked))
+    turn = so3_log(np.ascontiguousarray(was[:3, :3].T @ now[:3, :3]))
+    assert np.rad2deg(np.linalg.norm(turn)) == pytest.approx(0.1)
+    assert np.linalg.norm(now[:3, 3] - was[:3, 3]) == pytest.approx(5e-3)
 
 
 # ---------------------------------------------------------------- the command

@@ -1,1 +1,1 @@
-"""Public benchmarks: finds the sequences of a data set in a folder, runs them, and compares with published figures."""
+"""Public benchmarks: find the sequences of a data set in a folder, run them, and compare with published figures."""

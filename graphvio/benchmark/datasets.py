@@ -1,4 +1,4 @@
-"""The data sets: names of their sequences, and where their recordings, calibrations and true trajectories lie."""
+"""Public data sets: names of the sequences, and where to find recordings, calibrations and true trajectories."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphvio.sources import is_recording
 from graphvio.sources.surroundings import recordings_below
 
 _MAX_DEPTH = (
-    4  # of recordings below the folder: dataset/sequences/00, M_monado_datasets/MI_valve_index/MIO_others/MIO01
+    4  # levels searched for recordings: dataset/sequences/00, M_monado_datasets/MI_valve_index/MIO_others/MIO01
 )
 
 
@@ -19,13 +19,13 @@ _MAX_DEPTH = (
 class Dataset:
     """A public data set."""
 
-    key: str  # by which the command names it
+    key: str  # name of the data set on the command line
     title: str
-    pattern: re.Pattern[str]  # found in the name of a recording; its groups are the parts of the sequence's name
-    name_format: str  # of the sequence, from the groups
-    sequences: tuple[str, ...]  # those with a true trajectory, in the order of the table
-    calibrations: tuple[str, ...] = ()  # files or folders, next to a recording or above it; ``{0}`` is the first group
-    has_segments: bool = False  # whether its measure is KITTI's, over segments of 100 to 800 m
+    pattern: re.Pattern[str]  # searched for in the name of a recording; its groups are parts of the sequence's name
+    name_format: str  # format of the sequence's name, filled with the groups
+    sequences: tuple[str, ...]  # sequences with a true trajectory, in the order of the table
+    calibrations: tuple[str, ...] = ()  # files or folders, in a recording or above it; ``{0}`` is the first group
+    has_segments: bool = False  # whether KITTI's errors over segments of 100 to 800 m are reported, too
 
     def sequence_of(self, name: str) -> str | None:
         """Return the sequence that the name of a file or folder belongs to, such as ``MH_01`` of ``MH_01_easy``."""
@@ -40,10 +40,10 @@ class Dataset:
 class Sequence:
     """A recording of a sequence that was found in a folder."""
 
-    name: str  # of the sequence; with a number where several recordings are of it
+    name: str  # name of the sequence, with a number if there are several recordings of it
     recording: Path
-    rig: Path | None  # calibration, or None for what the recording carries
-    truth: Path | None = field(default=None)  # file, or None for the recording's own
+    rig: Path | None  # calibration, or None for the recording's own
+    truth: Path | None = field(default=None)  # file with the true trajectory, or None for the recording's own
 
 
 def _numbered(kind: str, count: int) -> tuple[str, ...]:
@@ -112,14 +112,14 @@ DATASETS = {
         ),
     )
 }
-"""By key. Of Monado, whose sequences become more, all that are found are run."""
+"""Data sets by key. Monado's list of sequences is empty since the data set grows: all sequences found are run."""
 
 
 def dataset_of(key: str) -> Dataset:
-    """Return the data set of a key.
+    """Return the data set with a key.
 
     Raises:
-        BenchmarkError: if there is none.
+        BenchmarkError: if there is no such data set.
     """
     if key not in DATASETS:
         raise BenchmarkError(f"{key}: is no data set that graphvio knows; give one of {', '.join(DATASETS)}")
@@ -127,9 +127,12 @@ def dataset_of(key: str) -> Dataset:
 
 
 def find_sequences(dataset: Dataset, folder: Path, rig: Path | None = None) -> list[Sequence]:
-    """Find the sequences of a data set in a folder that holds them at any place, in the order of its table.
+    """Find the sequences of a data set in a folder, and return them in the order of the data set's table.
 
-    Without a calibration for all of them, it is looked for where the data set has it.
+    Args:
+        dataset: the data set.
+        folder: folder that holds the sequences, up to four levels below.
+        rig: calibration for all sequences; None to look for it where the data set has it.
 
     Raises:
         BenchmarkError: if there are none.
@@ -161,7 +164,7 @@ def find_sequences(dataset: Dataset, folder: Path, rig: Path | None = None) -> l
 
 
 def _calibration(dataset: Dataset, recording: Path, folder: Path) -> Path | None:
-    """Find the calibration of a recording that does not carry it: next to it, or above it up to the folder."""
+    """Find a recording's calibration in it, or above it up to ``folder``; None if it has its own, or there is none."""
     kind = dataset.pattern.search(recording.name)
     if (recording / "rig.yaml").is_file() or kind is None:
         return None
@@ -177,7 +180,7 @@ def _calibration(dataset: Dataset, recording: Path, folder: Path) -> Path | None
 
 
 def _truth(dataset: Dataset, name: str, folder: Path) -> Path | None:
-    """Find the true trajectory of a bag, which Hilti's are without: a text file with the sequence's name."""
+    """Find the true trajectory of Hilti's bags, which do not contain it: a text file with the sequence's name."""
     if dataset.key != "hilti-2022":
         return None
     files = sorted(file for file in folder.rglob("*.txt") if dataset.sequence_of(file.stem) == name)

@@ -1,4 +1,4 @@
-"""The report of a benchmark: a page with the table, and a page for each sequence."""
+"""Writer of a benchmark's report: a page with the table, and a page for each sequence."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _sequence_page(benchmark: Benchmark, outcome: Outcome) -> str:
 
 
 def _timeline(events: list[dict[str, Any]], begin_ns: int, outcome: Outcome) -> bytes:
-    """Plot when each kind of event happened."""
+    """Plot the times of the events, one row per kind, as PNG."""
     kinds = sorted({event["kind"] for event in events})
     height_in = 0.9 + 0.28 * len(kinds)
     figure = empty_figure(8.6, height_in)

@@ -1,4 +1,4 @@
-"""Runs ``graphvio run`` for each sequence in a process of its own, several at once, and scores the results."""
+"""Runs ``graphvio run`` for each sequence in its own process, several at once, and evaluates the results."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
 RUN = (sys.executable, "-m", "graphvio", "run")
-"""The program that runs a sequence, in a process of its own."""
+"""Command that runs a sequence in its own process."""
 _NS_PER_S = 1e9
 _INCOMPLETE = 3  # exit code of ``graphvio run`` where less than 90 % of the framesets have a pose
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of one sequence."""
+    """The outcome of one sequence: its results and evaluation, or the reason of its failure."""
 
     sequence: str
     recording: Path
     results: Path  # folder of `graphvio.results`, absent or incomplete after a failure
-    summary: dict[str, Any] | None  # of the run, or None if it failed
-    evaluation: Evaluation | None  # or None without a true trajectory
-    reason: str  # why it failed, is incomplete or could not be evaluated; or empty
+    summary: dict[str, Any] | None  # contents of ``summary.json``, or None if the run failed
+    evaluation: Evaluation | None  # None if the run failed or could not be evaluated
+    reason: str  # why the run failed, is incomplete or could not be evaluated; or empty
 
     @property
     def has_failed(self) -> bool:
@@ -46,7 +46,7 @@ class Outcome:
 
     @property
     def ate_m(self) -> float | None:
-        """Rmse of the positions after SE(3) alignment, metres."""
+        """Rmse of the positions after SE(3) alignment, metres; None without an evaluation."""
         return None if self.evaluation is None else self.evaluation.ate_position_m.rmse
 
 
@@ -58,14 +58,14 @@ def run_sequences(
     jobs: int = 1,
     on_done: Callable[[Outcome], None] = lambda outcome: None,
 ) -> list[Outcome]:
-    """Run the odometry on all sequences; one that fails affects no other.
+    """Run the odometry on all sequences; one that fails does not affect the others.
 
     Args:
-        sequences: to run.
-        out: new or empty folder, which gets a folder of results and a log of each sequence.
-        options: of ``graphvio run``, the same for all.
-        jobs: how many run at once.
-        on_done: takes each outcome as soon as it is known, in the thread that calls.
+        sequences: the sequences to run.
+        out: new or empty folder, in which each sequence gets a result folder and a log.
+        options: options of ``graphvio run``, the same for all sequences.
+        jobs: number of sequences that run at once.
+        on_done: called with each outcome, in the order of the sequences, in the calling thread.
 
     Returns:
         The outcomes, in the order of the sequences.
@@ -93,7 +93,7 @@ def run_sequences(
 
 
 class _Processes:
-    """The processes that run, so that an interrupt can end them."""
+    """The running processes, so that an interrupt can end them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -113,7 +113,7 @@ class _Processes:
         return process.returncode, errors
 
     def terminate(self) -> None:
-        """End all processes, and begin no other."""
+        """End all processes, and let `run` begin no others."""
         with self._lock:
             self._is_ended = True
             for process in self._running:
@@ -138,7 +138,7 @@ def _run(each: Recorded, out: Path, options: Sequence[str], processes: _Processe
 
 
 def _reason(errors: str, code: int) -> str:
-    """Return the last line that the program wrote, which is its error."""
+    """Return the error of a failed run: the last line that it wrote."""
     lines = [line.strip() for line in errors.splitlines() if line.strip()]
     return lines[-1].removeprefix("graphvio: ") if lines else f"ended with exit code {code}, and said nothing"
 
@@ -153,10 +153,12 @@ def _evaluate(each: Recorded, results: Path) -> Evaluation:
 
 
 def evaluate_with(estimate: Trajectory, truth: Trajectory) -> Evaluation:
-    """Evaluate an estimate; surveyed points, between which truth cannot be interpolated, are met by the estimate.
+    """Evaluate an estimate; if the truth is too sparse to be interpolated, the estimate is interpolated to it.
+
+    Such a truth, with intervals of more than 0.25 s (median), consists of surveyed points.
 
     Raises:
-        TrajectoryError: if fewer than 3 poses belong together.
+        TrajectoryError: if fewer than 3 poses can be associated.
     """
     if len(truth) > 1 and np.median(np.diff(truth.stamps_ns)) > MAX_GAP_S * _NS_PER_S:
         estimate, _ = estimate.at(truth.stamps_ns, MAX_GAP_S)

@@ -1,4 +1,4 @@
-"""The result of a benchmark as one document, and as the table that papers have, beside published figures of others."""
+"""The result of a benchmark as JSON values, and as a table as in papers, beside published figures of other systems."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from graphvio.benchmark.run import Outcome
 from graphvio.version import __version__
 
 ALIGNMENT = "rmse of positions after SE(3) alignment of the whole causal trajectory, without scale"
-_WHOLE_SHARE = 0.8  # of a sequence's known length, from which on figures of whole sequences compare
+_WHOLE_SHARE = 0.8  # share of a sequence's length from which on the result is comparable with published figures
 
 
 @dataclass(frozen=True)
 class Published:
-    """Figures of one system on one data set."""
+    """Published figures of one system on one data set."""
 
     system: str
     method: str  # odometry or SLAM, and with which sensors
     source: str  # paper and table
-    read_from: str  # where the figures were read: the paper, or a copy of its table
+    read_from: str  # document from which the figures were read: the paper, or a copy of its table
     ate_m: Mapping[str, float]  # sequence -> rmse of positions after SE(3) alignment
 
 
 def published_on(key: str) -> list[Published]:
-    """Return what is known of a data set, by its key; empty if nothing could be verified."""
+    """Return the published figures on the data set with a key; empty if none could be verified."""
     return [Published(**each) for each in _document().get(key, {}).get("systems", [])]
 
 
 def lengths_m(key: str) -> dict[str, float]:
-    """Return the lengths of whole sequences of a data set, as far as they are known."""
+    """Return the path lengths of whole sequences of the data set with a key, as far as they are known."""
     return dict(_document().get(key, {}).get("lengths_m", {}))
 
 
@@ -56,7 +56,7 @@ class Benchmark:
 
     @property
     def published(self) -> list[Published]:
-        """Figures of others, of those systems that have some of a sequence that was run."""
+        """Published figures of the systems that have a figure on any of the sequences that were run."""
         names = {outcome.sequence for outcome in self.outcomes}
         return [each for each in published_on(self.dataset.key) if names.intersection(each.ate_m)]
 
@@ -67,7 +67,7 @@ class Benchmark:
         return [name for name in self.dataset.sequences if name not in names]
 
     def note(self, outcome: Outcome) -> str:
-        """Return what is to be known of a row: why it failed, or that it is a part of its sequence only."""
+        """Return a note on a row: why it failed, or that it covers only a part of its sequence; empty if neither."""
         if outcome.reason or outcome.evaluation is None:
             return outcome.reason
         whole_m = lengths_m(self.dataset.key).get(outcome.sequence)
@@ -77,7 +77,7 @@ class Benchmark:
         return ""
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert to values of JSON."""
+        """Convert to JSON values."""
         return {
             "dataset": self.dataset.key,
             "folder": self.folder,
@@ -111,13 +111,13 @@ class Benchmark:
         }
 
     def head(self) -> list[str]:
-        """Return the heads of the columns of `rows`."""
+        """Return the column headings of `rows`."""
         segments = ["t, %", "r, deg/100 m"] if self.dataset.has_segments else []
         systems = [each.system for each in self.published]
         return ["sequence", "length, m", "graphvio, m", *segments, "completion, %", "time, s", "x real time", *systems]
 
     def rows(self) -> list[list[str]]:
-        """Return the cells of the table: a row for each sequence, then the means over those with a figure."""
+        """Return the cells of the table: a row for each sequence, then the means over the sequences with a figure."""
         rows = [self._cells(outcome) for outcome in self.outcomes]
         if len(rows) < 2:
             return rows
@@ -145,7 +145,7 @@ class Benchmark:
         ]
 
     def notes(self) -> list[str]:
-        """Return what must be said below the table: notes on rows, what is absent, and all sources."""
+        """Return the lines below the table: notes on rows, absent sequences, and the sources of all figures."""
         lines = [f"{outcome.sequence}: {note}" for outcome in self.outcomes if (note := self.note(outcome))]
         load = "one sequence at a time" if self.jobs == 1 else f"{self.jobs} sequences at once"
         lines.append(f"graphvio: ATE, {ALIGNMENT}; times with {load}")

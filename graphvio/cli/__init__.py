@@ -1,4 +1,4 @@
-"""The command line: one module per command, which imports heavy packages when it is called."""
+"""The command line, with one module per command; heavy packages are imported only when a command is called."""
 
 import sys
 from collections.abc import Callable
@@ -53,12 +53,12 @@ def _options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    if context.invoked_subcommand != "doctor":  # which shows what is missing
+    if context.invoked_subcommand != "doctor":  # the command that shows which packages are missing
         check_requirements()
 
 
 def _add(command: Callable[..., Any], name: str | None = None) -> None:
-    """Add a command; the list of all commands shows the whole first sentence of its docstring."""
+    """Add a command; the list of all commands shows the first paragraph of its docstring in full."""
     app.command(name=name, short_help=(command.__doc__ or "").partition("\n\n")[0])(command)
 
 
@@ -85,20 +85,20 @@ _add(with_json(warmup))
 
 
 def main() -> None:
-    """Run the program: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
+    """Run the program. Errors of the input become one line and exit code 2; ``--verbose`` also shows the traceback."""
     limit_blas_threads()  # no module of the command line has imported numpy by now
     with lasting_streams() as output:
         code = _run()
         if output is not None:
             output.flush()
-            if output.error is not None and not isinstance(output.error, BrokenPipeError):  # its reader has enough
+            if output.error is not None and not isinstance(output.error, BrokenPipeError):  # the reader needs no more
                 warn(f"standard output cannot be written ({output.error.strerror}); write it to another place")
                 code = code or EXIT_BAD_INPUT
     sys.exit(code)
 
 
 def _run() -> int:
-    """Run the program, and return its exit code."""
+    """Run the command of the command line, and return the exit code."""
     try:
         with interruptible():
             code = app(prog_name="graphvio", standalone_mode=False)
@@ -111,7 +111,7 @@ def _run() -> int:
             raise
         return _refuse(str(error))
     except Exception as error:
-        usage = getattr(error, "format_message", None)  # of the command-line library's own errors
+        usage = getattr(error, "format_message", None)  # only errors of the command-line library have it
         if usage is None:
             print_error(type(error).__name__, str(error))
             raise

@@ -1,4 +1,4 @@
-"""``graphvio benchmark``: the sequences of a public data set, beside published figures."""
+"""``graphvio benchmark``: runs the sequences of a public data set and compares with published figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graphvio.cli.shared import EXIT_INCOMPLETE, ends_at_interrupt, warn
 if TYPE_CHECKING:
     from graphvio.benchmark.table import Benchmark
 
-_PLAIN_WIDTH = 160  # of a table in a file, whose columns need not be cut
+_PLAIN_WIDTH = 160  # characters; width of a table outside a terminal, where no column has to be cut
 
 
 def benchmark(
@@ -42,13 +42,13 @@ def benchmark(
     no_imu: options.NoImu = False,
     to_s: options.ToS = None,
 ) -> None:
-    """Run the sequences of a public data set that a folder holds, and compare with published figures.
+    """Run the sequences of a public data set in a folder, and compare the results with published figures.
 
-    Prints the table that papers have: ATE by sequence, completion and time, beside figures of other systems with their
-    sources. A sequence that fails is a row that says why. The results hold a report, report.html, with a page for each
-    sequence.
+    Prints a table as papers have it: ATE of each sequence, completion and time, next to published figures of other
+    systems and their sources. If a sequence fails, its row says why. The results include a report, report.html, with a
+    page for each sequence.
 
-    Ends with exit code 0; with 2 where no sequence is found; with 3 where one failed.
+    The exit code is 0; 2 if no sequence is found; 3 if a sequence failed.
 
     Examples:
 
@@ -83,7 +83,7 @@ def benchmark(
         found = [each for each in found if each.name in wanted]
     results = out if out is not None else ResultWriter.new_folder(Path("results"), f"benchmark-{chosen.key}")
     at_once = min(jobs if jobs is not None else max(1, (os.cpu_count() or 1) // 2), len(found))
-    warm_up_visibly(default_rig(), settings)  # once, and not as a part of each sequence's time
+    warm_up_visibly(default_rig(), settings)  # once, so that no sequence's time includes it
     passed = ["--config", config] + (["--no-imu"] if no_imu else []) + ([] if to_s is None else ["--to", str(to_s)])
     with ends_at_interrupt(f"interrupted; what was finished is in {results}"):
         outcomes = run_sequences(

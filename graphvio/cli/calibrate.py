@@ -1,4 +1,4 @@
-"""``graphvio calibrate`` and ``graphvio calibrate-trajectories``: where the pairs of a rig are, from their motion."""
+"""``graphvio calibrate`` and ``graphvio calibrate-trajectories``: calibration of rigs from their motion."""
 
 from __future__ import annotations
 
@@ -59,20 +59,20 @@ def calibrate(
     to_s: options.ToS = None,
     seed: options.Seed = 0,
 ) -> None:
-    """Calibrate a rig from a recording of its motion: where its stereo pairs are, or all of its parameters.
+    """Calibrate a rig from a recording of its motion: the poses of its stereo pairs, or all of its parameters.
 
-    Turn the rig about two axes while you walk, in a place with texture; half a minute is enough.
+    For the recording, turn the rig about two axes while you walk, in a place with texture; half a minute is enough.
 
-    --what pairs finds where the pairs are relative to each other, which need not share a view. The rig file must be
-    right about each pair's own two cameras; where it has the pairs does not matter. Each pair is also compared with the
-    IMU, if there is one.
+    --what pairs estimates the poses of the stereo pairs relative to each other; their views need not overlap. The rig
+    file must be right about the two cameras within each pair; its poses of the pairs may be wrong. Each pair is also
+    compared with the IMU, if there is one.
 
-    --what all finds everything, from a rig file that is about right: cameras (focal lengths, principal points,
-    distortion), stereo (the extrinsics left to right), imu (cameras to IMU, time offset, scale), and pairs. With
-    cameras, stereo or imu all else is kept as in the rig file, which must be right about it. With an IMU, single
-    cameras will do.
+    --what all estimates everything, from a rig file that is approximately right: cameras (focal lengths, principal
+    points, distortion), stereo (the extrinsics left to right), imu (cameras to IMU, time offset, scale), and pairs.
+    With cameras, stereo or imu only these parameters are calibrated; the others are kept as in the rig file, which must
+    be right about them. With an IMU, rigs of single cameras can be calibrated like this, too.
 
-    Ends with exit code 0; with 2 where nothing can be determined; with 3 where the motions determine a part only.
+    The exit code is 0; 2 if nothing can be determined; 3 if the motions determine only a part.
 
     Examples:
 
@@ -135,10 +135,10 @@ def calibrate_trajectories(
     scale: options.Scale = "auto",
     seed: options.Seed = 0,
 ) -> None:
-    """Find where cameras are relative to each other from their trajectories, whatever odometry made them.
+    """Estimate the poses of cameras relative to each other from their trajectories, made by any odometry.
 
-    Each trajectory may have a world frame and a clock of its own: offsets between clocks are found from the angular
-    speeds, and drifts. Exit codes are those of `graphvio calibrate`.
+    Each trajectory may have its own world frame and its own clock: the offsets between clocks are found from the
+    angular speeds, and drifts are estimated, too. The exit codes are those of `graphvio calibrate`.
 
     Examples:
 
@@ -164,7 +164,12 @@ def calibrate_trajectories(
 
 
 def _is_of_pairs(what: str, given: Mapping[str, bool]) -> bool:
-    """Return whether only the pairs are calibrated, by their motions, for which there are options of its own."""
+    """Return whether ``--what`` is ``pairs``; if not, refuse the options that are only for calibrating pairs.
+
+    Args:
+        what: the value of ``--what``.
+        given: name of each of these options -> whether it was given.
+    """
     from graphvio.errors import CalibrationError, ConfigError
     from graphvio.odometry.recorded_calibration import GROUPS
 
@@ -179,7 +184,7 @@ def _is_of_pairs(what: str, given: Mapping[str, bool]) -> bool:
 
 
 def _working(text: str) -> AbstractContextManager[object]:
-    """Show in a terminal that work is in progress."""
+    """Return a context manager that shows in a terminal, with a text, that work is in progress."""
     from contextlib import nullcontext
 
     from rich.console import Console
@@ -200,7 +205,7 @@ def _scale_mode(text: str) -> ScaleMode:
 
 
 def _check_outputs(out: Path | None, report: Path | None, inputs: list[Path]) -> None:
-    """Refuse outputs that cannot or should not be written, before minutes are spent."""
+    """Refuse output paths that cannot or must not be written, before a calibration of minutes begins."""
     import os
 
     from graphvio.errors import CalibrationError
@@ -273,7 +278,7 @@ def _with_sigma(value: float, sigma: float, known: bool) -> str:
 
 
 def _finish(found: Calibration, report: Path | None, source: str, count: int) -> None:
-    """Publish what was found, write the report if it is asked for, and say by the exit code whether it is all."""
+    """Publish the calibration, write a report if asked for, and end with exit code 3 if the calibration is partial."""
     from graphvio.calibration.report.document import document
 
     publish(document(found))

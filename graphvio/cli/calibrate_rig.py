@@ -1,4 +1,4 @@
-"""What ``graphvio calibrate --what`` does for all but the pairs: the whole rig, or some of its parameters."""
+"""``graphvio calibrate --what`` for other choices than pairs: calibration of a whole rig, or some of its parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None, report: Path | None) -> None:
-    """Calibrate the rig of a recording, print the result, and write what is asked for."""
+    """Calibrate the rig of a recording, print the result, and write the rig file and the report if asked for."""
     from graphvio.calibration.report.rig_page import write_rig_report
     from graphvio.cli.warming import warm_up_visibly
     from graphvio.odometry.recorded_calibration import calibrate_recording

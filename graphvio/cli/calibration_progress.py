@@ -1,4 +1,4 @@
-"""Progress while ``graphvio calibrate`` reads a recording, with advice on the motions that are still needed."""
+"""Progress bar of ``graphvio calibrate`` while it reads a recording, with advice on motions that are still needed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from graphvio.runtime import on_interrupt
 
 
 class CalibrationProgress:
-    """Progress bar while a recording is read, with a guide's advice if there is one; Ctrl-C ends the recording."""
+    """Context manager with a progress bar while a recording is read; Ctrl-C ends the reading early.
+
+    Args:
+        total: number of framesets in the recording.
+        guided: names of the pairs, to show advice on their motions; None for no advice.
+    """
 
     _GUIDE_EVERY = 20  # framesets
     _PLAIN_EVERY = 100  # framesets, where there is no terminal
@@ -42,7 +47,7 @@ class CalibrationProgress:
             self._print(f"frameset {self.framesets}: {self._advice.text}")
 
     def on_frameset(self, number: int, separate: SeparateMotions) -> bool:
-        """Show the progress, and return whether to end."""
+        """Show the progress after a frameset, and return whether the reading has to end, after Ctrl-C."""
         self.framesets = number
         self._bar.update(self._task, completed=number)
         if number == self._total:

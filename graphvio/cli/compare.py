@@ -1,4 +1,4 @@
-"""``graphvio compare``: several results against one truth, or against each other."""
+"""``graphvio compare``: compares several results with a true trajectory, or with each other."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def compare(
 ) -> None:
     """Compare several results: ATE, RPE, drift and completion, and the ratio of each ATE to the first one.
 
-    Ends with exit code 4 where --max-ate is exceeded, or a result cannot be compared.
+    The exit code is 4 if --max-ate is exceeded, or a result cannot be compared.
 
     Examples:
 

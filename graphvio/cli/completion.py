@@ -1,4 +1,4 @@
-"""What the shell completes as values of arguments and options. Names are imported when it asks: that takes a moment."""
+"""Shell completion of values of arguments and options; modules that hold the names are imported only when it runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from typing import Any, get_args
 def _completing(
     where: str, names_in: Callable[[Any], Iterable[str]] = lambda names: names
 ) -> Callable[[str], list[str]]:
-    """Return the function by which typer completes one of the names that ``MODULE:OBJECT`` holds."""
+    """Return a completion function for typer that proposes names.
+
+    Args:
+        where: ``MODULE:OBJECT``, the object that holds the names.
+        names_in: returns the names in this object.
+    """
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names_in(resolve_name(where)) if name.startswith(incomplete)]

@@ -1,4 +1,4 @@
-"""Display of a live run: a panel in a terminal, or elsewhere a line every few seconds."""
+"""Display of a live run: a panel in a terminal, or a line every few seconds where there is none."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ _COLOURS = {"tracking": "green", "coasting": "yellow", "initialising": "cyan", "
 
 
 class Dashboard(TerminalDisplay):
-    """Shows the figures, devices and events of a live run; a context manager."""
+    """Shows the figures, devices and events of a live run; a context manager.
+
+    Args:
+        title: title of the panel.
+        events: queue from which the events to show are taken.
+    """
 
     def __init__(self, title: str, events: BoundedQueue[Event]) -> None:
         super().__init__()
@@ -34,7 +39,7 @@ class Dashboard(TerminalDisplay):
         self._shown: dict[str, tuple[float, int]] = {}  # kind -> time when last shown, and count since then
 
     def show(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
-        """Show the newest figures and events, at most at the refresh rate."""
+        """Show the newest figures and events; the figures at most at the refresh rate."""
         now = time.monotonic()
         while (event := self._events.get(0.0)) is not None:
             self._show_event(event, now)
@@ -48,7 +53,7 @@ class Dashboard(TerminalDisplay):
             self._print(line_of(figures))
 
     def _show_event(self, event: Event, now: float) -> None:
-        """Show an event, of each kind (and device) one in a few seconds with the count of those left out."""
+        """Show an event; of each kind (and device) at most one every few seconds, with the number of those left out."""
         kind = event.detail if event.kind.startswith("device_") else event.kind
         last, left_out = self._shown.get(kind, (-_PLAIN_S, 0))
         if now - last < _PLAIN_S:
@@ -78,7 +83,7 @@ class Dashboard(TerminalDisplay):
 
 
 def rows_of(figures: Figures) -> list[tuple[str, str]]:
-    """Return name and text of each row but the status."""
+    """Return the name and the text of each row, except for the row of the status."""
     pairs = sorted(name.removesuffix("_points") for name in figures if name.endswith("_points"))
     rows = [
         (
@@ -122,7 +127,7 @@ def line_of(figures: Figures) -> str:
 
 
 def summary_of(figures: Figures) -> str:
-    """Return what a run estimated and what it lost, in one line."""
+    """Return one line with the number of estimates, the latency, and the counts of lost or skipped measurements."""
     kinds = ("skipped", "images_not", "results_not", "imu_lost")
     lost = "".join(f", {name} {count}" for name, count in figures.items() if name.startswith(kinds))
     return (

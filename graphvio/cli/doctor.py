@@ -1,4 +1,4 @@
-"""``graphvio doctor``: what is installed on this machine, and the check of what no command runs without."""
+"""``graphvio doctor``: shows what is installed on this machine; and a check of the packages that all commands need."""
 
 import os
 import platform
@@ -24,7 +24,7 @@ REQUIRED = {
     "jinja2": "jinja2",
     "rich": "rich",
 }
-"""Module -> the package that has it."""
+"""Module that all commands need -> the package that contains it."""
 
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
 _OPTIONAL = {
@@ -42,10 +42,10 @@ _OPTIONAL = {
 
 
 def check_requirements() -> None:
-    """Check that all are there, before hours of work end at a plot.
+    """Check that all required packages are installed, so that none is found missing only after hours of work.
 
     Raises:
-        MissingRequirementError: if one is not.
+        MissingRequirementError: if a package is missing.
     """
     absent = [package for module, package in REQUIRED.items() if find_spec(module) is None]
     if absent:
@@ -95,7 +95,7 @@ def _table(findings: dict[str, Any]) -> Any:
 
 
 def examine() -> dict[str, Any]:
-    """Return all findings, as JSON can hold them."""
+    """Return the findings of ``graphvio doctor``, in types that JSON has."""
     from graphvio.kernel_cache import any_compiled_before, cache_root, shared_root
     from graphvio.version import __version__
 
@@ -103,7 +103,7 @@ def examine() -> dict[str, Any]:
     kernels = [file.stat().st_size for file in folder.rglob("*.nbc")]
     versions: dict[str, str | None] = {"graphvio": __version__, "python": platform.python_version()}
     versions |= {package: _version(package) if find_spec(module) else None for module, package in REQUIRED.items()}
-    del versions["opencv-python-headless"]  # one of several packages that have its module
+    del versions["opencv-python-headless"]  # only one of several packages that contain cv2
     versions["opencv"] = next((version for name in _OPENCV if (version := _version(name))), None)
     return {
         "versions": versions,
@@ -129,7 +129,7 @@ def examine() -> dict[str, Any]:
 
 
 def kernel_modules() -> list[str]:
-    """Return the modules that hold kernels, found in their text: importing them would compile some."""
+    """Return the names of the modules with kernels. Their text is searched, since an import would compile some."""
     import graphvio
 
     package = Path(graphvio.__file__).parent

@@ -1,4 +1,4 @@
-"""``graphvio evaluate``: one trajectory against the truth."""
+"""``graphvio evaluate``: compares one trajectory with the true one."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def evaluate(
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, drift and loop-closure error.
 
-    Truth is interpolated to the estimate's stamps, and the estimate aligned with it by rotation and translation.
+    The truth is interpolated to the estimate's stamps, and the estimate is aligned with it by a rotation and a
+    translation.
 
     Examples:
 

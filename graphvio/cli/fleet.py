@@ -1,4 +1,4 @@
-"""``graphvio fleet optimize``: many sessions side by side."""
+"""``graphvio fleet optimize``: optimises many sessions in parallel."""
 
 from __future__ import annotations
 
@@ -59,11 +59,12 @@ def optimize(
     no_loops: options.NoLoops = False,
     refine_calibration: options.RefineCalibration = False,
 ) -> None:
-    """Optimise many sessions, each by itself, and write a table.
+    """Optimise many sessions, each by itself, and write a table of the results.
 
-    A session that fails affects no other: it is tried three times, and then has its error in the table. Ends with exit
-    code 0; with 2 where the input cannot be used; with 3 where a session failed. When run again with the same --out, it
-    does what is missing.
+    A session that fails does not affect the others: it is tried three times, and then the table has its error. When the
+    command is run again with the same --out, it computes only the missing results.
+
+    The exit code is 0; 2 if the input cannot be used; 3 if a session failed.
 
     Examples:
 

@@ -1,4 +1,4 @@
-"""``graphvio info`` and ``graphvio dump-config``: the contents of a recording, and the values of a profile."""
+"""``graphvio info`` and ``graphvio dump-config``: show the contents of a recording and the values of a profile."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def info(
     source: options.Source,
     rig: options.RigFile = None,
 ) -> None:
-    """Show what a recording holds: its duration, its rig, and cameras and IMU with their rates, gaps and jitter.
+    """Show what a recording contains: its duration, its rig, and cameras and IMU with their rates, gaps and jitter.
 
-    Of a session or bag it shows all topics, and how far clocks can be trusted: stamps that go back or jump, the delay
-    from a message's stamp to its recording with its drift, and how well cameras are synchronised.
+    For a session or bag it shows all topics, and how far their clocks can be trusted: stamps that go back or jump, the
+    delay from a message's stamp to its recording and the drift of this delay, and how well cameras are synchronised.
 
-    Ends with exit code 0; with 2, and a line that says why, where the path is no recording that can be run.
+    The exit code is 0; 2, with a line that says why, if the path is no recording that can be run.
 
     Examples:
 

@@ -1,4 +1,4 @@
-"""``--json`` of all commands that print a table or a summary: one document on stdout, and nothing else there."""
+"""The option ``--json`` of commands that print a table or a summary: one document on stdout, and nothing else."""
 
 from __future__ import annotations
 
@@ -24,36 +24,36 @@ _results: ContextVar[list[object] | None] = ContextVar("results", default=None)
 
 
 def publish(result: object) -> None:
-    """Hand over what a command has found, which is printed if ``--json`` was given."""
+    """Set the result of a command, which is printed if ``--json`` was given; a later result replaces it."""
     results = _results.get()
     if results is not None:
         results.append(result)
 
 
 def error_document(kind: str, message: str) -> dict[str, dict[str, str]]:
-    """Return what ``--json`` prints of a command that fails."""
+    """Return the document that ``--json`` prints if a command fails: the error's class and message."""
     return {"error": {"kind": kind, "message": message}}
 
 
 def print_error(kind: str, message: str) -> None:
-    """Print the document of an error if ``--json`` was given, of whatever command."""
+    """Print the document of an error if ``--json`` is anywhere on the command line."""
     if "--json" in sys.argv:
         typer.echo(json.dumps(error_document(kind, message), indent=2))
 
 
 def with_json(command: Callable[..., None]) -> Callable[..., None]:
-    """Add ``--json`` to a command that publishes its result; its lines on stdout are then left out.
+    """Add ``--json`` to a command that publishes its result; with this option, other output on stdout is suppressed.
 
-    A command that ends with an exit code of its own still prints the document; of one that fails, `graphvio.cli.main`
-    prints the error. ``--verbose`` is added, too, which `graphvio.cli.main` looks for. A parameter whose type is a
-    dataclass of options, see `graphvio.cli.options`, becomes these options.
+    A command that ends with a `typer.Exit` still prints its document; if a command fails, `graphvio.cli.main` prints
+    the error. The option ``--verbose`` is added, too; `graphvio.cli.main` looks for it on the command line. A parameter
+    whose type is a dataclass of options, see `graphvio.cli.options`, is replaced by these options.
     """
     hints = get_type_hints(command, include_extras=True)
     groups = {name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)}
 
     @wraps(command)
     def run(*, verbose: bool = False, as_json: bool = False, **values: Any) -> None:
-        """Run the command; with ``as_json``, print its document alone."""
+        """Run the command; with ``as_json``, print only its document."""
         for name, group in groups.items():
             values[name] = group(**{each: values.pop(each) for each in inspect.signature(group).parameters})
         if not as_json:
@@ -85,7 +85,7 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _parameters(command: Callable[..., object]) -> list[inspect.Parameter]:
-    """Return the parameters of a command or of a dataclass of options, with such dataclasses expanded."""
+    """Return the parameters of a command or of a dataclass of options; nested dataclasses of options are expanded."""
     hints = get_type_hints(command, include_extras=True)
     found: list[inspect.Parameter] = []
     for name, each in inspect.signature(command).parameters.items():
@@ -97,7 +97,11 @@ def _parameters(command: Callable[..., object]) -> list[inspect.Parameter]:
 
 
 def plain(value: object) -> object:
-    """Convert to values of JSON; NaN and infinity, which it lacks, become null."""
+    """Convert a value to types that JSON has; NaN and infinity, which it lacks, become null.
+
+    Raises:
+        TypeError: if the value has a type that cannot be converted.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
@@ -110,6 +114,6 @@ def plain(value: object) -> object:
         return str(value) if isinstance(value, str) else value
     if isinstance(value, Path):
         return str(value)
-    if hasattr(value, "tolist"):  # of numpy
+    if hasattr(value, "tolist"):  # arrays and scalars of numpy
         return plain(value.tolist())
     raise TypeError(f"{type(value).__name__} is no value of JSON")

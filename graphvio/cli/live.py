@@ -1,4 +1,4 @@
-"""``graphvio live``: the odometry on sensors in real time, and the list of those that are connected."""
+"""``graphvio live``: runs the odometry on sensors in real time, or lists the connected devices."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def live(
         bool, typer.Option("--serve", help="Serve other programs of this machine, see graphvio serve.")
     ] = False,
 ) -> None:
-    """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM, which leave a complete recording.
+    """Run the odometry on live sensors until they end, or until Ctrl-C or SIGTERM; either leaves a complete recording.
 
-    When processing falls behind, fewer corners are tracked, and then framesets are skipped, which is counted; IMU
-    samples never are. Ends with exit code 3 where the disk became full.
+    When processing falls behind, fewer corners are tracked, and then framesets are skipped and counted; IMU samples are
+    never skipped. The exit code is 3 if a recording is incomplete, because the disk became full or was too slow.
 
     Examples:
 
@@ -61,7 +61,7 @@ def live(
 
 
 def _list() -> None:
-    """List the connected devices of each kind, or the library that it lacks."""
+    """Print and publish the connected devices of each kind of source, or why they cannot be listed."""
     from graphvio.errors import GraphvioError
     from graphvio.live.sources import KINDS, kind_of
 

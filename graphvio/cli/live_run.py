@@ -1,6 +1,6 @@
-"""Runs the odometry on a live source with displays, recording and services around it, for several commands.
+"""Run of the odometry on a live source, with display, recording and services; shared by several commands.
 
-Commands import it when they run: it imports all stages.
+Commands import this module only when they run, since it imports all stages.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def run_live(spec: str, options: LiveOptions, services: Services | None, view: b
 
     Args:
         spec: the source, ``KIND[:DEVICE][?OPTION=VALUE]``, or a recording's path.
-        options: of the command.
-        services: for other programs, or None.
-        view: whether the viewer's window opens.
+        options: the options that all live commands share.
+        services: services for other programs, or None for none.
+        view: whether the viewer's window is opened.
     """
     _check_recording(options)
     share_heap()
@@ -72,7 +72,7 @@ def run_live(spec: str, options: LiveOptions, services: Services | None, view: b
             for line in started.lines:
                 typer.echo(line, err=True)
         recorder = None
-        if options.record is not None:  # last: a port in use leaves no file behind
+        if options.record is not None:  # last, so that no file is left if a port is in use
             image_format: ImageFormat = "png" if options.png else "raw"
             recorder = SessionRecorder(options.record, running.rig, image_format, waits=not source.is_realtime)
             recording.callback(recorder.close)
@@ -99,7 +99,7 @@ def run_live(spec: str, options: LiveOptions, services: Services | None, view: b
 
 
 def _check_recording(options: LiveOptions) -> None:
-    """Refuse a session that cannot be written, before sensors are started."""
+    """Refuse a session file that cannot be written, before sensors are started."""
     from graphvio.errors import SessionError
     from graphvio.sessions.storage import exists_error
 
@@ -116,7 +116,7 @@ def _check_recording(options: LiveOptions) -> None:
 
 
 def _source_of(spec: str, options: LiveOptions) -> LiveSource:
-    """Make a source as the options of a command ask for it; no sensor is started."""
+    """Return the live source that the options select; no sensor is started."""
     from graphvio.live.source import SelectedCameras
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
@@ -133,7 +133,8 @@ def _prepare(
     """Open a source and load the kernels.
 
     Returns:
-        The source's rig, calibrated as earlier runs learnt, and the memory of that; None where none is kept.
+        The source's rig, with the calibration that an earlier run has stored, if any; and the store of this
+        calibration, or None if calibrations of this source are not stored.
     """
     from graphvio.live.calibration_memory import devices_of
 
@@ -142,12 +143,12 @@ def _prepare(
     if memory is not None:
         rig = _remembered(memory, rig)
     set_up_threads()
-    warm_up_visibly(rig, config)  # measurements that come meanwhile are not used
+    warm_up_visibly(rig, config)  # measurements that arrive meanwhile are not used
     return rig, memory
 
 
 def _memory(devices: str | None, rig: Rig, config: Config, options: LiveOptions) -> CalibrationMemory | None:
-    """Return the memory of a source's calibration, emptied if it is to be, or None where none is kept."""
+    """Return the store of a source's calibration, emptied after ``--forget-calibration``, or None if there is none."""
     from graphvio.live.calibration_memory import CalibrationMemory
 
     if devices is None or not config.estimates_calibration:
@@ -163,7 +164,7 @@ def _memory(devices: str | None, rig: Rig, config: Config, options: LiveOptions)
 
 
 def _remembered(memory: CalibrationMemory, rig: Rig) -> Rig:
-    """Return the rig with what earlier runs learnt, or as it is."""
+    """Return the rig with the calibration that an earlier run has stored, or unchanged if there is none to use."""
     from graphvio.errors import RigError
 
     try:
@@ -192,16 +193,16 @@ def _viewer(stack: ExitStack, rig: Rig, services: Services | None, view: bool) -
     return viewer
 
 
-# ---------------------------------------------------------------------- the run, and what is said and kept at its end
+# ---------------------------------------------------------------------- the run, and what is printed and kept after it
 
 
 def _run_until_end(
     name: str, running: LiveOdometry, signals: StopSignals, started: Started | None, options: LiveOptions
 ) -> Exception | None:
-    """Run, and show what happens, until the source has ended, a signal came, a service failed, or the time is over.
+    """Run with a dashboard until the source has ended, a signal came, a service failed, or the duration is over.
 
     Returns:
-        The error by which it ended, to be raised after everything until then is saved; None if there was none.
+        The error that ended the run, to be raised once everything until then is saved; None if there was none.
     """
     until = None if options.duration is None else monotonic() + options.duration
     try:
@@ -229,7 +230,7 @@ def _keep(memory: CalibrationMemory, running: LiveOdometry) -> None:
 
 
 def _print_recorded(path: Path, status: Mapping[str, float | int | str | None]) -> bool:
-    """Print the size of the recording, and return whether it is complete."""
+    """Print the size of the recording, and whether parts are missing; return whether it is complete."""
     size = f"{path.stat().st_size / 1e6:.1f} MB, " if path.exists() else ""
     typer.echo(f"{path}: {size}{status['recorded_framesets']} framesets")
     if status["recording_stopped"]:

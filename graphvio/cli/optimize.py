@@ -1,4 +1,4 @@
-"""``graphvio optimize``: recorded sessions as a whole, with loop closures."""
+"""``graphvio optimize``: optimises recorded sessions as a whole, with loop closures."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def optimize(
 ) -> None:
     """Optimise the trajectory of recorded sessions from all their measurements.
 
-    Calibrates the rig from the whole recording, runs the odometry, finds places that are seen again, by any camera, and
-    optimises everything as one graph. Several sessions of one place are brought into one frame. An interrupted run is
-    continued by the same command with the same --out. A configuration with calibration: {online: false} takes the rig
-    file as it is.
+    Calibrates the rig from the whole recording, runs the odometry, detects revisited places with all cameras, and
+    optimises everything as one graph. Several sessions of one place are transformed into one frame. To continue an
+    interrupted run, repeat the command with the same --out. With calibration: {online: false} in the configuration, the
+    rig file is used as it is.
 
-    Ends with exit code 0; with 2 where the input cannot be used; with 3 where less than 90 % of a session's framesets
-    have a pose (the results are written all the same); with 130 after Ctrl-C.
+    The exit code is 0; 2 if the input cannot be used; 3 if less than 90 % of a session's framesets have a pose (the
+    results are written all the same); 130 after Ctrl-C.
 
     Examples:
 
@@ -70,7 +70,7 @@ def optimize(
     from graphvio.runtime import set_up_threads
 
     if not no_loops:
-        colmap()  # before hours of work, not after
+        colmap()  # fails here if it is not installed, not after hours of work
     settings = Config.load(reading.config)
     opened = [open_recording(source, reading, settings) for source in sources]
     folder = out
@@ -92,7 +92,7 @@ def optimize(
 
 
 def _print_session(session: Path) -> bool:
-    """Print what was found of a session's calibration, and warnings; return whether most framesets have a pose."""
+    """Print a session's calibration findings, warnings and faults; return whether `MIN_COMPLETION` is reached."""
     from graphvio.optimization.session_calibration import session_findings
 
     odometry = session / "odometry"
@@ -113,7 +113,7 @@ def _print_session(session: Path) -> bool:
 
 
 def print_summary(found: Optimization, folder: Path) -> None:
-    """Print loop closures, cost and refined calibration of an optimisation."""
+    """Print an optimisation's loop closures, its cost and the refined calibration."""
     from graphvio.optimization.report.calibration import calibrations
     from graphvio.optimization.report.numbers import median_sigmas, rig_of
     from graphvio.optimization.report.page import plain

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have."""
+"""Arguments and options that several commands share."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,12 @@ from graphvio.cli import completion
 
 
 def _if(is_possible: Callable[[float], bool], wanted: str) -> Callable[[float | None], float | None]:
-    """Return the check of an option: a value that is not possible is refused, by a message that names the option."""
+    """Return a callback for typer that refuses impossible values of an option.
+
+    Args:
+        is_possible: returns whether a value is possible.
+        wanted: possible values in words, for the error message.
+    """
 
     def check(value: float | None) -> float | None:
         if value is not None and not is_possible(value):
@@ -22,7 +27,7 @@ def _if(is_possible: Callable[[float], bool], wanted: str) -> Callable[[float | 
     return check
 
 
-# All refuse NaN, which passes typer's own `min`.
+# All refuse NaN, which typer's own `min` accepts.
 not_negative = _if(lambda value: value >= 0.0, "0 or more")
 seconds = _if(lambda value: 0.0 <= value < math.inf, "seconds, 0 or more")
 duration = _if(lambda value: value > 0.0, "seconds, more than 0")
@@ -123,7 +128,7 @@ Verbose = Annotated[bool, typer.Option("--verbose", help="Show the traceback of 
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
-    """What is read of recordings, and the configuration."""
+    """Options of commands that read recordings: what is read of them, and the configuration."""
 
     rig: RigFile = None
     topics: Topics = None
@@ -138,7 +143,7 @@ class ReadingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions:
-    """What all live runs may be asked for."""
+    """Options of all commands that run on live sensors."""
 
     rig: RigFile = None
     cameras: Cameras = None

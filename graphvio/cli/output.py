@@ -1,4 +1,4 @@
-"""Standard output and stderr as commands see them: streams that take every line, also where none can be written."""
+"""Streams in place of standard output and stderr that raise no error where nothing can be written."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any, TextIO, cast
 
 
 class LastingStream:
-    """A text stream of which a failure ends nothing: the full disk of its file, or a reader that has left its pipe.
+    """A text stream that raises no error when writing fails, because a disk is full or the reader of a pipe has gone.
 
-    What is written afterwards is thrown away, so that a command still writes its results.
+    Text that is written after the failure is discarded, so that a command still writes its results.
 
     Attributes:
-        error: the failure, or None.
+        error: the error of the write that failed, or None.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -24,7 +24,7 @@ class LastingStream:
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write a text, or throw it away."""
+        """Write a text, or discard it if that fails; return the number of characters."""
         try:
             return self._stream.write(text)
         except OSError as error:
@@ -32,7 +32,7 @@ class LastingStream:
             return len(text)
 
     def flush(self) -> None:
-        """Write what is buffered, or throw it away."""
+        """Write the buffered text, or discard it if that fails."""
         try:
             self._stream.flush()
         except OSError as error:
@@ -43,15 +43,15 @@ class LastingStream:
 
     def _give_up(self, error: OSError) -> None:
         self.error = error
-        with Path(os.devnull).open("wb") as nowhere:  # takes what is still buffered, too
+        with Path(os.devnull).open("wb") as nowhere:  # receives the text that is still buffered, too
             os.dup2(nowhere.fileno(), self._stream.fileno())
 
 
 @contextmanager
 def lasting_streams() -> Iterator[LastingStream | None]:
-    """Let failures of standard output and stderr end nothing inside.
+    """Replace standard output and stderr within the block by a `LastingStream` each.
 
-    Yields standard output, None where the process has none.
+    Yields standard output, or None if the process has none.
     """
     out, err = (None if stream is None else LastingStream(stream) for stream in (sys.stdout, sys.stderr))
     with redirect_stdout(cast(TextIO, out)), redirect_stderr(cast(TextIO, err)):

@@ -1,4 +1,4 @@
-"""``graphvio record`` and ``graphvio convert``: sessions with the odometry's results, and other formats."""
+"""``graphvio record`` and ``graphvio convert``: record the odometry's results, and convert recordings."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def record(
 ) -> None:
     """Run the odometry and record images, IMU, rig, poses and events as a session (MCAP, ROS 2 messages).
 
-    When the disk is full recording stops, the odometry goes on, and the exit code is 3. After Ctrl-C, with exit code
-    130, the session can be read until then.
+    When the disk is full, recording stops, the odometry goes on, and the exit code is 3. After Ctrl-C the exit code is
+    130, and the session can be read up to the interruption.
 
     Example:
 
@@ -90,7 +90,7 @@ def convert(
 ) -> None:
     """Write a recording in another format: MCAP, a ROS 1 or ROS 2 bag, or the EuRoC/ASL layout.
 
-    Ends with exit code 3 where the disk became full, with a line that says whether the result can be read.
+    If the disk becomes full, the exit code is 3, and a line says whether the result can be read.
 
     Examples:
 
@@ -131,7 +131,11 @@ def convert(
 
 
 def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
-    """Load the true trajectory of a recording; one that cannot be read is left out with a warning."""
+    """Load the true trajectory of a recording, only around its interval unless ``is_whole``.
+
+    Returns:
+        The trajectory; None if there is none, or, with a warning, if it cannot be read.
+    """
     from graphvio.errors import TrajectoryError
     from graphvio.trajectory_files import load_trajectory
 
@@ -146,7 +150,7 @@ def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
 
 
 def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, odometry: Odometry | None) -> None:
-    """Record measurements, truth and an odometry's results; without an odometry, stop when the disk is full."""
+    """Write measurements, true poses and an odometry's results; without an odometry, stop when the disk is full."""
     from graphvio.measurements.sensors import FrameSet
     from graphvio.runtime import HeldInterrupt, interruptible
     from graphvio.sessions.writer import SessionWriter

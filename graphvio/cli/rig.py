@@ -1,4 +1,4 @@
-"""``graphvio rig``: a calibration as graphvio understands it, and several of them as one rig."""
+"""``graphvio rig``: shows a calibration as graphvio reads it, and joins several calibrations to one rig."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ def rig(
     files: Annotated[list[Path], typer.Argument(help="Calibration file or recording; several are joined.")],
     out: Annotated[Path | None, typer.Option(help="Write the rig to this rig.yaml.")] = None,
 ) -> None:
-    """Show a calibration as graphvio understands it, join those of several pairs, and write rig.yaml.
+    """Show a calibration as graphvio reads it, join the calibrations of several pairs, and write rig.yaml.
 
-    Pairs that share no view are calibrated one by one, such as by Kalibr: give the file of each, first one with the
-    IMU. Those with the IMU are at their places; of the others the place is guessed, and `graphvio calibrate` finds it.
+    Pairs whose views do not overlap are calibrated one by one, for example by Kalibr: give the file of each, and first
+    one with the IMU. The poses of pairs with the IMU in their file are known; those of the others are guessed, and
+    `graphvio calibrate` finds them.
 
     Examples:
 
@@ -57,7 +58,7 @@ def rig(
 
 
 def _description(joined: Rig, guessed: tuple[str, ...]) -> dict[str, Any]:
-    """Return what the rig consists of, as JSON can hold it."""
+    """Return a description of the rig in types that JSON has; ``guessed`` names the groups with a guessed pose."""
     from graphvio.rig import StereoPair
 
     return {

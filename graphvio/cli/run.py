@@ -1,4 +1,4 @@
-"""``graphvio run``: a recording in, a folder of results out."""
+"""``graphvio run``: runs the odometry on a recording, and writes a folder of results."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def run(
 ) -> None:
     """Estimate the trajectory of a recording.
 
-    Ends with exit code 0; with 2 where the input cannot be used; with 3 where less than 90 % of the framesets
-    since the initialisation have a pose (the results are written all the same).
+    The exit code is 0; 2 if the input cannot be used; 3 if less than 90 % of the framesets since the initialisation
+    have a pose (the results are written all the same).
 
     Examples:
 
@@ -87,7 +87,7 @@ def run(
 
 
 class _ProgressLine(TerminalDisplay):
-    """One line that is refreshed in a terminal, and a new line every few seconds elsewhere."""
+    """Display of the progress: one line that is refreshed in a terminal, or a new line every few seconds elsewhere."""
 
     _REFRESH_S = 0.1
     _PLAIN_S = 5.0

@@ -1,4 +1,4 @@
-"""``graphvio serve``: the odometry on live sensors as the front-end of other programs."""
+"""``graphvio serve``: runs the odometry on live sensors and serves its results to other programs."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def serve(
     ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
 ) -> None:
-    """Run the odometry on live sensors and serve estimates and keyframes by gRPC, ROS 2 topics and to browsers.
+    """Run the odometry on live sensors and serve estimates and keyframes by gRPC, by ROS 2 topics and to browsers.
 
-    Clients send corrections back. Without TLS and a token only this machine is served.
+    Clients can send corrections back. Without TLS and a token, only clients on this machine are served.
 
     Examples:
 

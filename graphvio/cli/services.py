@@ -1,4 +1,4 @@
-"""Services of a live run for other programs: gRPC, ROS 2 topics, a page for browsers."""
+"""Services of a live run for other programs: gRPC, ROS 2 topics and a page for browsers."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from graphvio.slam.service.options import ServiceOptions
     from graphvio.slam.service.server import GrpcServer
 
-_SOON_S = 0.5  # readers that are done by then need no message
+_SOON_S = 0.5  # if clients have read everything by then, no message is printed
 
 
 @dataclass(frozen=True)
 class Started:
-    """Running services."""
+    """Services that have been started."""
 
     address: str  # address of gRPC
     lines: Sequence[str]  # lines to print, one for each service
@@ -33,14 +33,14 @@ class Started:
 
 @dataclass(frozen=True)
 class Services:
-    """Choice of services, and who may use them."""
+    """The choice of services, and the options of gRPC, such as who may connect."""
 
     grpc: ServiceOptions
     ros2_domain: int | None = None  # domain of the ROS 2 topics, or None for none
     web_port: int | None = None  # port of the page for browsers, or None for none
 
     def settings(self, config: Config) -> Config:
-        """Return a configuration whose keyframes carry their images: clients choose what they are sent."""
+        """Return the configuration with images in keyframes; each client chooses what is sent to it."""
         return replace(config, keyframes=replace(config.keyframes, images=True))
 
     def check(self) -> None:
@@ -52,7 +52,10 @@ class Services:
             from graphvio.ros2.publisher import Publisher  # noqa: F401
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
-        """Serve an odometry until the stack closes; a `KeyboardInterrupt` where the run is to stop before that."""
+        """Start the services of an odometry, which run until the stack closes.
+
+        A subclass that has to wait for a service raises `KeyboardInterrupt` if ``is_stopped`` returns True meanwhile.
+        """
         from graphvio.slam.service.server import GrpcServer
 
         address = stack.enter_context(_until_read(GrpcServer(running, self.grpc))).address
@@ -70,7 +73,7 @@ class Services:
 
 @contextmanager
 def _until_read(server: GrpcServer) -> Iterator[GrpcServer]:
-    """Serve, and at the end of the odometry wait for clients that still read."""
+    """Run a server within the block, and then wait for clients that have not read everything."""
     from graphvio.slam.service.server import READ_S
 
     with server:

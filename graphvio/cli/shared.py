@@ -29,12 +29,12 @@ _FILES = "a trajectory file (TUM, EuRoC or KITTI), or BAG:TOPIC"
 
 
 def warn(message: str) -> None:
-    """Print a line to stderr."""
+    """Print a line to stderr, after the program's name."""
     typer.echo(f"graphvio: {message}", err=True)
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return the names of files and folders, or their paths where names repeat."""
+    """Return the names of files (without suffix) and folders, or all paths if names repeat."""
     names = [path.name if path.is_dir() else path.stem for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
@@ -43,7 +43,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def result_trajectory(path: Path, smoothed: bool = False) -> Path:
-    """Return the trajectory file of a folder of results; another path as it is.
+    """Return the trajectory file in a folder of results; return any other path unchanged.
 
     Raises:
         TrajectoryError: if the folder holds no results; the message says what is accepted.
@@ -67,10 +67,10 @@ def result_trajectory(path: Path, smoothed: bool = False) -> Path:
 
 
 def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
-    """Read a trajectory file, or the truth of a recording.
+    """Read a trajectory file, or the true trajectory of a recording.
 
     Raises:
-        TrajectoryError: if there is none.
+        TrajectoryError: if there is no true trajectory.
         SourceError: if the recording cannot be read.
     """
     from graphvio.errors import TrajectoryError
@@ -78,7 +78,7 @@ def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
     from graphvio.sources import is_recording, open_source
     from graphvio.trajectory_files import load_trajectory
 
-    if path.is_dir() and not is_store(path):  # a session holds its truth itself
+    if path.is_dir() and not is_store(path):  # a session contains its truth
         if not is_recording(path):
             raise TrajectoryError(f"{path}: is no recording; as the truth give a recording that has one, {_FILES}")
         truth = open_source(path).truth
@@ -91,7 +91,7 @@ def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
 
 
 def open_recording(source: Path, options: ReadingOptions, settings: Config) -> Source:
-    """Open a recording as the options of a command ask for it."""
+    """Open a recording with the rig, the cameras, the topics and the interval that a command's options select."""
     from graphvio.rig_files import load_rig
 
     reading = reading_of(options)
@@ -103,7 +103,12 @@ def open_recording(source: Path, options: ReadingOptions, settings: Config) -> S
 
 
 def reading_of(options: ReadingOptions) -> Reading:
-    """Parse what the options of a command say of what is read."""
+    """Parse a command's options on what is read of a recording.
+
+    Raises:
+        RigError: if ``--pairs`` is not a list of numbers.
+        SourceError: if ``--topics`` is not a list of NAME=TOPIC.
+    """
     from graphvio.errors import RigError, SourceError
     from graphvio.sources.reading import Reading
 
@@ -123,10 +128,10 @@ def reading_of(options: ReadingOptions) -> Reading:
 
 
 def check_scene(source: Path) -> None:
-    """Refuse the name of a simulated scene, of which there is no recording here, with the command that makes it."""
+    """Refuse a path that does not exist but names a simulated scene; the error has the command that simulates it."""
     from graphvio.errors import SourceError
 
-    with suppress(OSError):  # opening it says what is wrong
+    with suppress(OSError):  # opening the recording then reports the error
         if source.exists():
             return
     from graphvio.simulation import SCENE_NAMES  # takes a moment to import
@@ -139,7 +144,7 @@ def check_scene(source: Path) -> None:
 
 
 def check_session_name(path: Path) -> None:
-    """Refuse a session that could not be read by its name."""
+    """Refuse a session file whose name does not end in .mcap, by which sessions are recognised."""
     from graphvio.errors import SessionError
 
     if path.suffix != ".mcap":
@@ -150,7 +155,7 @@ def check_session_name(path: Path) -> None:
 
 
 def framesets_bar() -> Progress:
-    """Return a progress bar that disappears at its end: description, count and remaining time."""
+    """Return a progress bar with description, count and remaining time, which disappears at its end."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -161,9 +166,10 @@ def framesets_bar() -> Progress:
 
 @contextmanager
 def stage_bars(totals: Mapping[str, int] | None = None) -> Iterator[Callable[[str, float, float], None]]:
-    """Show progress bars that stay, one for each stage: description, count and elapsed time.
+    """Show one progress bar for each stage, with description, count and elapsed time; the bars stay visible.
 
-    Yields the function that shows how far a stage is; totals may be known beforehand.
+    Yields a function that shows the progress of a stage, by its name, the amount done, and the total. Totals that are
+    passed here, stage -> total, take precedence.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -183,7 +189,7 @@ def stage_bars(totals: Mapping[str, int] | None = None) -> Iterator[Callable[[st
 
 @contextmanager
 def ends_at_interrupt(message: str) -> Iterator[None]:
-    """End the command at Ctrl-C inside, with a message and the exit code of interrupted ones."""
+    """On Ctrl-C within the block, end the command with a message and the exit code 130."""
     from graphvio.runtime import interruptible
 
     try:
@@ -196,7 +202,10 @@ def ends_at_interrupt(message: str) -> Iterator[None]:
 
 
 class TerminalDisplay:
-    """A context manager around text on stderr that is refreshed in place, and printed line by line elsewhere."""
+    """Base class of displays on stderr: text that is refreshed in place in a terminal, and lines elsewhere.
+
+    It is a context manager.
+    """
 
     def __init__(self) -> None:
         from rich.console import Console

@@ -1,4 +1,4 @@
-"""``graphvio simulate``: a simulated recording with exact truth."""
+"""``graphvio simulate``: makes a simulated recording with exact truth."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ def simulate(
 ) -> None:
     """Simulate a walk, drive or flight with cameras and an IMU, and write it in the EuRoC/ASL layout.
 
-    With a calibration error the true rig is in rig-true.yaml next to rig.yaml; images are the same.
+    With --calibration-error, rig.yaml is wrong and rig-true.yaml next to it has the true rig; the images are the same.
 
     The corridor has a door that opens in front, a crowd, a bend with blank walls and failing lamps. The loop goes once
-    around four corridors, passes its first position again, turns round and comes back past it. The street is driven by
-    car, with a stereo pair; the flight is a drone's, 50 m over fields, and begins in the air.
+    around four corridors, passes its first position again, turns round and comes back past it. The street is a drive by
+    car, with a stereo pair. The flight is that of a drone, 50 m over fields, and begins in the air.
 
     Examples:
 
@@ -124,7 +124,7 @@ def simulate(
 
 
 def _check_names(rig: Rig, file: str) -> None:
-    """Refuse names of cameras that the EuRoC/ASL layout does not have."""
+    """Refuse a rig whose cameras have names that the EuRoC/ASL layout does not allow."""
     from graphvio.errors import RigError
 
     names = [camera.name for camera in rig.cameras]

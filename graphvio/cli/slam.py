@@ -1,4 +1,4 @@
-"""``graphvio slam``: the odometry with a small SLAM system behind it."""
+"""``graphvio slam``: runs the odometry together with a small SLAM system."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def slam(
 ) -> None:
     """Run the odometry with a small SLAM system in a process of its own, which corrects the pose in the map.
 
-    The SLAM recognises places, optimises a graph of them and sends corrections by gRPC, as any other SLAM system would.
-    With --map the rig is localised in a saved map. When the SLAM fails, the odometry goes on; exit code 3 then.
+    The SLAM system recognises places, optimises a graph of them and sends corrections by gRPC, as any other SLAM system
+    would. With --map, the rig is localised in a saved map. If the SLAM system fails, the odometry goes on, and the exit
+    code is 3.
 
     Examples:
 
@@ -65,12 +66,12 @@ def slam(
 
 @dataclass(frozen=True)
 class _WithMapping(Services):
-    """gRPC on this machine, ROS 2 topics where asked for, and the SLAM as a client of gRPC."""
+    """The services gRPC on this machine and, if asked for, ROS 2 topics; and the SLAM as a client of gRPC."""
 
-    task: MappingTask = field(kw_only=True)  # of the SLAM
+    task: MappingTask = field(kw_only=True)  # task of the SLAM's process
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
-        """Serve the odometry, and start the SLAM; see `Services.start`."""
+        """Start the services of the odometry, and the SLAM; see `Services.start`."""
         from graphvio.cli.slam_process import SlamProcess
         from graphvio.live.outputs import PathOutput
         from graphvio.viewer import WebOptions

@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from graphvio.mapping.process import MappingTask
 
 _POLL_S = 0.1
-_PATIENCE_S = 300.0  # until a SLAM that is behind has processed the last keyframes
+_PATIENCE_S = 300.0  # time after the odometry's end in which a SLAM that is behind has to process the last keyframes
 _PATHS = ("odometry.txt", "online.txt")
 
 
 class SlamProcess:
-    """The process of a SLAM: when it fails, a warning is printed and the odometry goes on.
+    """The process of the SLAM. When it fails, a warning is printed and the odometry goes on.
 
     Args:
         task: task of the process; its working folder is made here, so that it is removed even if the process is killed.
-        path: path of the odometry, written next to the map.
+        path: recorder of the odometry's path, which is written next to the map.
     """
 
     def __init__(self, task: MappingTask, path: PathOutput) -> None:
@@ -43,7 +43,7 @@ class SlamProcess:
         self._is_reported = False
         context = get_context("spawn")
         self._ready = context.Event()  # before signals are blocked: its helper process unblocks them
-        with stop_signals_blocked():  # signals are for the odometry, with which the SLAM ends
+        with stop_signals_blocked():  # the odometry handles signals, and the SLAM ends with it
             try:
                 self._folder = tempfile.mkdtemp(prefix="graphvio-map-")
             except OSError as error:
@@ -53,11 +53,11 @@ class SlamProcess:
             self._process.start()
 
     def wait_ready(self, is_stopped: Callable[[], bool]) -> None:
-        """Wait until the SLAM takes keyframes: earlier places would be lost.
+        """Wait until the SLAM receives keyframes; places of keyframes before that would be missing in the map.
 
         Raises:
-            KeyboardInterrupt: if the odometry is to stop earlier.
-            ServiceError: if the process fails earlier.
+            KeyboardInterrupt: if ``is_stopped`` returns True before that.
+            ServiceError: if the process fails before that.
         """
         while not self._ready.wait(_POLL_S):
             if is_stopped():
@@ -66,12 +66,12 @@ class SlamProcess:
                 raise ServiceError(self._failure)
 
     def check(self) -> None:
-        """Warn, once, if the process has failed."""
+        """Print a warning, once, if the process has failed."""
         if self._process.exitcode and not self._is_reported:
             self._warn(f"{self._failure}; the odometry goes on without it")
 
     def finish(self) -> bool:
-        """Wait for the saved map, and write the odometry's path next to it; returns whether all of that was done."""
+        """Wait for the saved map, and write the odometry's path next to it; return whether both succeeded."""
         if self._process.is_alive():
             typer.echo("waiting for the SLAM, which processes the last keyframes", err=True)
         self._process.join(_PATIENCE_S)
@@ -110,14 +110,14 @@ class SlamProcess:
 
     def _write_path(self, out: Path) -> None:
         with writing(out, MapError, "the odometry's path is lost"):
-            out.mkdir(parents=True, exist_ok=True)  # a SLAM that failed may not have
+            out.mkdir(parents=True, exist_ok=True)  # a SLAM that failed may not have made it
             for name in _PATHS:
-                (out / name).unlink(missing_ok=True)  # an earlier session's would be taken for this one's
+                (out / name).unlink(missing_ok=True)  # a file of an earlier session would be taken for one of this
         self._path.write(out)
 
 
 def _map(task: MappingTask, ready: Event) -> None:
-    """Run the task in the process."""
+    """Run the SLAM's task; called in the SLAM's process."""
     from graphvio.mapping.process import run_mapping
 
     with lasting_streams():

@@ -1,4 +1,4 @@
-"""``graphvio view``: a result folder in the viewer."""
+"""``graphvio view``: shows a result folder in the viewer."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,9 +16,9 @@ def view(
     ] = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Open a result folder in rerun's window: path, covariance, biases, events.
+    """Show a result folder in the rerun viewer: path, covariance, biases, events.
 
-    If the run has saved a recording (`.rrd`) in the folder, that one is opened: it also has the images.
+    If the run has saved a rerun recording (`.rrd`) in the folder, it is opened instead, since it also has the images.
 
     Examples:
 

@@ -16,7 +16,7 @@ _PERIOD_S = 0.5
 
 
 def warm_up_visibly(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> None:
-    """Compile or load all kernels, see `graphvio.warmup.warm_up`; in a terminal a bar shows what is compiled."""
+    """Compile or load all kernels, see `graphvio.warmup.warm_up`; in a terminal, a bar shows the compilation."""
     from graphvio.warmup import warm_up
 
     columns = (BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
@@ -33,7 +33,7 @@ def warm_up_visibly(rig: Rig, config: Config, *, wait_for_calibration: bool = Tr
 
 
 def _watch(bar: Progress, has_ended: threading.Event) -> None:
-    """Show the bar from when a kernel is compiled until the end."""
+    """Show the bar from the first compilation of a kernel until the end of the warm-up."""
     from graphvio.kernels import compilation_progress
 
     task = bar.add_task("", total=None)

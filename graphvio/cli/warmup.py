@@ -1,4 +1,4 @@
-"""``graphvio warmup``: compile the numerical kernels before they are needed."""
+"""``graphvio warmup``: compiles the numerical kernels before they are needed."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import typer
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
 
-_WITH_PAIRS = ("paper", "stereo+back")  # each kind of rig has kernels of its own
+_WITH_PAIRS = ("paper", "stereo+back")  # one rig of each kind, since each kind has kernels of its own
 _SINGLE_CAMERAS = ("surround", "phone")
 
 
 def warmup(config: options.ConfigName = "default") -> None:
-    """Compile the numerical kernels for this machine, once: for images of machines and containers.
+    """Compile all numerical kernels for this machine in advance, such as for an image of a machine or container.
 
-    They are those of all kinds of rigs; the first command compiles by itself those of its own. GRAPHVIO_CACHE_DIR
-    names the folder of the compiled kernels.
+    Kernels for all kinds of rigs are compiled; without this, the first command compiles those that it needs. The
+    environment variable GRAPHVIO_CACHE_DIR names the folder of the compiled kernels.
 
     Examples:
 
@@ -40,7 +40,7 @@ def warmup(config: options.ConfigName = "default") -> None:
     for name in (*_WITH_PAIRS, *single_cameras):
         warm_up_visibly(rig_of(name), settings)
     poses = Trajectory(np.array([0, 2]), np.tile(np.eye(4), (2, 1, 1)))
-    poses.at(np.array([1]), max_gap_s=1.0)  # as a true trajectory is compared with
+    poses.at(np.array([1]), max_gap_s=1.0)  # as in a comparison with a true trajectory
     rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 0.0]))
     taken_s = perf_counter() - begun_s
     publish({"folder": str(cache_root()), "wall_s": taken_s})

@@ -1,6 +1,6 @@
-"""Configuration of all stages, read from profiles and files.
+"""The configuration of all stages, and its reading from profiles and YAML files.
 
-A profile is a YAML file in ``configs/`` that overrides some of the values; so is a user's own file.
+A profile is a YAML file in ``configs/`` that overrides some of the default values. A user's own file works the same.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from graphvio.wording import nearest
 
 @dataclass(frozen=True)
 class Config:
-    """Configuration of all stages."""
+    """Configuration of all stages, one attribute for each stage."""
 
     corners: CornerConfig = field(default_factory=CornerConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -48,10 +48,10 @@ class Config:
     live: LiveConfig = field(default_factory=LiveConfig)
 
     def __post_init__(self) -> None:
-        """Check that the stages fit together.
+        """Check that the values of different stages are compatible.
 
         Raises:
-            ConfigError: if they do not.
+            ConfigError: if they are not.
         """
         if self.fusion.estimator == "filter" and self.motion.reference != "previous":
             raise ConfigError(
@@ -67,19 +67,20 @@ class Config:
     def estimates_calibration(self) -> bool:
         """Whether the calibration is estimated while the odometry runs.
 
-        Tracks that are followed from frame to frame drift, all alike, and would be taken for an error of the cameras.
+        This needs motion that is measured from keyframes: tracks that are followed from frame to frame all drift in a
+        similar way, which would be taken for an error of the cameras.
         """
         return self.calibration.online and self.motion.reference == "keyframe"
 
     @staticmethod
     def load(name_or_path: str | Path) -> Config:
-        """Read a profile by its name, or a YAML file.
+        """Read a configuration from a profile or a YAML file.
 
         Args:
-            name_or_path: name of a profile, or path of a file with the values to change.
+            name_or_path: name of a profile, or path of a YAML file (.yaml or .yml) with the values to change.
 
         Returns:
-            The configuration; values that are not in it have their default.
+            The configuration; values that the file does not set have their default.
 
         Raises:
             ConfigError: if there is no such profile or file, or a key or value in it is not valid.
@@ -105,17 +106,17 @@ class Config:
 
     @staticmethod
     def from_yaml(text: str, where: str = "configuration") -> Config:
-        """Parse YAML; missing values keep their default.
+        """Parse a configuration in YAML; missing values keep their default.
 
         Args:
-            text: a mapping of stages to mappings of names to values.
-            where: where it was read, for messages.
+            text: the YAML text: a mapping of stages to mappings of names to values.
+            where: where the text was read, such as a file's path; for error messages.
 
         Returns:
             The configuration.
 
         Raises:
-            ConfigError: if it is no YAML mapping, or a key or value is not valid.
+            ConfigError: if the text is no YAML mapping, or a key or value is not valid.
         """
         import yaml
 
@@ -137,14 +138,14 @@ class Config:
         return text
 
     def sha256(self) -> str:
-        """Return a digest of all values: equal for configurations that do the same."""
+        """Return the SHA-256 digest of all values, in hexadecimal; equal configurations have equal digests."""
         return hashlib.sha256(self.to_yaml().encode()).hexdigest()
 
 
 def profiles() -> dict[str, Path]:
-    """Return name -> file of the configurations that come with graphvio."""
+    """Return the profiles that come with graphvio: name -> YAML file."""
     here = Path(__file__).parent.parent
-    for folder in (here / "configs", here.parent / "configs"):  # as installed, as checked out
+    for folder in (here / "configs", here.parent / "configs"):  # in an installed package, in a checkout
         if folder.is_dir():
             return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     return {}

@@ -1,4 +1,4 @@
-"""Types and ranges of configuration values, and construction of dataclasses from mappings."""
+"""Checks of the types and ranges of configuration values, and construction of dataclasses from mappings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
 class StageConfig:
-    """A part of the configuration: a frozen dataclass whose values are checked whenever it is constructed."""
+    """Base class of a stage's configuration: a frozen dataclass whose values are checked when it is constructed."""
 
     def __post_init__(self) -> None:
         """Check all values.
@@ -32,16 +32,16 @@ class StageConfig:
         """
         for name, hint in get_type_hints(type(self)).items():
             value = checked(hint, getattr(self, name), f"{type(self).__name__}: {name}")
-            object.__setattr__(self, name, value)  # 12.0 as 12, so that equal configurations have equal digests
+            object.__setattr__(self, name, value)  # 12.0 is stored as 12: equal configurations have equal digests
 
 
 def build(kind: type[Any], data: object, where: str) -> Any:
-    """Build a dataclass from a mapping of names to values; what is missing keeps its default.
+    """Build a dataclass from a mapping of names to values; missing values keep their default.
 
     Args:
         kind: the dataclass.
         data: the mapping, as read from a file.
-        where: where it was read, for messages.
+        where: where the mapping was read, such as a file's path; for error messages.
 
     Raises:
         ConfigError: if ``data`` is no mapping, or a key or value is not valid.
@@ -64,15 +64,19 @@ def build(kind: type[Any], data: object, where: str) -> Any:
 
 
 def checked(hint: Any, value: object, where: str) -> object:
-    """Convert a value to the type that it should have.
+    """Check a value's type and range, and convert it to its type.
 
     Args:
-        hint: the type.
-        value: as read from a file, or passed in.
-        where: where it was read, for messages; ends in the value's name.
+        hint: the type: bool, int, float, a ``Literal``, or one of these or None.
+        value: the value, as read from a file or passed to the constructor.
+        where: where the value was read, for error messages; the last word is the value's name, which determines the
+            range.
+
+    Returns:
+        The value, of the type ``hint``.
 
     Raises:
-        ConfigError: if it is of another type, or out of the range that its name implies.
+        ConfigError: if the value is of another type, or out of the range that its name implies.
     """
     choices = get_args(hint)
     if type(None) in choices:
@@ -108,5 +112,5 @@ def checked(hint: Any, value: object, where: str) -> object:
 
 
 def _number_of_text(value: object) -> object:
-    """Convert numbers such as 1e-9, which YAML takes for text; numbers in quotes stay text."""
+    """Convert text such as 1e-9, which YAML does not read as a number; other text, such as "12", stays text."""
     return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value

@@ -1,4 +1,4 @@
-"""Error of estimated trajectories against the truth.
+"""Errors of estimated trajectories against the truth.
 
 Definitions:
 
@@ -6,16 +6,16 @@ Definitions:
   ``max_gap_s`` apart; other estimates are left out and counted.
 - *ATE*: distance between positions, and angle between rotations, after SE(3) alignment of all associated
   positions (Umeyama's least squares without scale).
-- *Scale error*: by how much the estimate's lengths are too long, by the scale of Umeyama's Sim(3) alignment. What is
-  left of the ATE with that alignment is the part that neither a wrong baseline nor an unknown scale explains.
-- *RPE* over 1 s, or a distance along the truth: error of the motion from each pose to the pose nearest to that
-  distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
+- *Scale error*: by how much the estimate's lengths are too long, from the scale of Umeyama's Sim(3) alignment. The ATE
+  after that alignment is the part of the error that neither a wrong baseline nor an unknown scale explains.
+- *RPE* over 1 s, or over a distance along the truth: error of the motion from each pose to the later pose that is
+  nearest to that distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
 - *Drift*: position error of the last pose with the start aligned by position and rotation (the first 5 % of the path
   and at least 2 s), in percent of the path. ``ate_percent`` is ATE rmse in percent of the path.
 - *Loop-closure error*, where the truth is at least 4 m long and ends within 1 m of its start: estimated minus true
   displacement from start to end.
 
-Lengths are of the associated truth.
+Path lengths are those of the associated truth.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True)
 class LoopClosureError:
-    """Error of the displacement from start to end, in metres and in percent of the path."""
+    """Error of the displacement from the start to the end, in metres and in percent of the path."""
 
     error_m: float
     error_percent: float
@@ -59,32 +59,32 @@ class LoopClosureError:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Error of an estimate against the truth; the module defines each figure."""
+    """Errors of an estimate against the truth; the module's docstring defines each figure."""
 
     associated: int  # number of estimates that have a true pose
     estimates: int  # number of all estimates
     duration_s: float  # from the first to the last associated stamp
-    path_length_m: float  # of the truth in between
-    ate_position_m: Stats  # metres
-    ate_rotation_deg: Stats  # degrees
+    path_length_m: float  # path length of the truth in between
+    ate_position_m: Stats  # ATE of the position, metres
+    ate_rotation_deg: Stats  # ATE of the rotation, degrees
     ate_percent: float | None  # ATE rmse in percent of the path; None for paths under 0.1 m
-    scale_error_percent: float | None  # of the estimate's lengths; None for paths under 0.1 m
+    scale_error_percent: float | None  # scale error, positive if lengths are too long; None for paths under 0.1 m
     ate_scaled_m: float | None  # ATE rmse of position after alignment with scale; None for paths under 0.1 m
     drift_m: float  # position error at the end with the start aligned
     drift_percent: float | None  # the same in percent of the path; None for paths under 0.1 m
     loop_closure: LoopClosureError | None  # None where the truth does not return to its start
     rpe: Mapping[str, RelativeError]  # ``1 s``, ``1 m``, ``5 m``... -> error, for distances within the path's length
-    kitti_percent: float | None  # mean over all segments of 100 to 800 m, or None
-    kitti_deg_per_m: float | None  # mean over all segments of 100 to 800 m, or None
+    kitti_percent: float | None  # mean position error over all segments of 100 to 800 m, or None if there are none
+    kitti_deg_per_m: float | None  # mean rotation error over the same segments, or None
     truth_T_nav: Float  # (4, 4) alignment of the ATE
-    stamps_ns: Int  # (associated,) stamps
-    position_error_m: Float  # (associated,) after alignment
-    rotation_error_deg: Float  # (associated,) after alignment
+    stamps_ns: Int  # (associated,) stamps of the associated estimates
+    position_error_m: Float  # (associated,) position error after alignment
+    rotation_error_deg: Float  # (associated,) rotation error after alignment
     aligned: Trajectory  # associated estimates in the truth's frame
     truth: Trajectory  # truth at the same stamps
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert all figures, without the series, to values of JSON."""
+        """Convert all figures, without the series over time, to JSON values."""
         figures = {name: value for name, value in vars(self).items() if name not in _SERIES}
         figures["ate_position_m"] = asdict(self.ate_position_m)
         figures["ate_rotation_deg"] = asdict(self.ate_rotation_deg)
@@ -101,8 +101,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
     """Evaluate an estimate against the truth.
 
     Args:
-        estimate: poses of body in nav. All epochs are aligned as one, so that a break counts as error.
-        truth: poses of body in any fixed frame, on the same clock.
+        estimate: poses of body in nav. All epochs are aligned as one, so that a break counts as an error.
+        truth: true poses of body in any fixed frame, on the same clock.
         max_gap_s: longest interval of the truth that is bridged by interpolation, seconds.
 
     Raises:
@@ -149,8 +149,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
 class Compared:
     """One of several results that are compared."""
 
-    name: str  # of the result
-    evaluation: Evaluation | None  # against the truth, or None where that failed
+    name: str  # name of the result
+    evaluation: Evaluation | None  # evaluation against the truth, or None if it failed
     why_not: str  # reason of the failure, or empty
     ate_ratio: float | None  # ATE rmse of position relative to the first result that could be evaluated
 
@@ -161,7 +161,7 @@ class Compared:
 
 
 def compare(names: Sequence[str], results: Sequence[Trajectory], truth: Trajectory) -> list[Compared]:
-    """Evaluate several results against the same truth, see `evaluate`; one that fails does not affect the others."""
+    """Evaluate several results against the same truth by `evaluate`; one that fails does not affect the others."""
     compared: list[Compared] = []
     for name, result in zip(names, results, strict=True):
         try:

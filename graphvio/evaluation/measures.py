@@ -47,13 +47,13 @@ class RelativeError:
     position_m: Stats  # metres
     rotation_deg: Stats  # degrees
     percent: float | None  # mean position error in percent of the distance; None for a duration
-    deg_per_m: float | None  # mean rotation error by distance; None for a duration
+    deg_per_m: float | None  # mean rotation error per distance; None for a duration
 
 
 def umeyama_se3(source: Float, target: Float) -> Float:
     """Compute least-squares ``target_T_source`` (4, 4), without scale, of corresponding points (N, 3).
 
-    Points on one line leave the rotation about it undefined: see `align`.
+    If all points lie on one line, the rotation about it is undefined: see `align`.
     Reference: S. Umeyama, *Least-squares estimation of transformation parameters between two point patterns*,
     PAMI 13(4), 1991.
     """
@@ -65,7 +65,7 @@ def umeyama_se3(source: Float, target: Float) -> Float:
 def align(estimate: Trajectory, truth: Trajectory) -> Float:
     """Compute ``truth_T_nav`` (4, 4) by Umeyama's method from poses of equal stamps.
 
-    Where the truth stays within a centimetre of one line, positions do not define a rotation and
+    If the truth deviates from one line by less than 1 cm (rms), the positions do not define a rotation, and
     `align_with_rotations` is used.
     """
     centred = truth.positions - truth.positions.mean(axis=0)
@@ -78,7 +78,7 @@ def align(estimate: Trajectory, truth: Trajectory) -> Float:
 def align_with_rotations(estimate: Trajectory, truth: Trajectory) -> Float:
     """Compute ``truth_T_nav`` (4, 4) from positions and rotations of poses of equal stamps.
 
-    A rotation counts like points 1 m along the body's axes, so that the result is defined at standstill, too.
+    A pose's rotation counts like points 1 m along the body's axes, so that the result is defined at standstill, too.
     """
     p, q = estimate.positions, truth.positions
     p_mean, q_mean = p.mean(axis=0), q.mean(axis=0)
@@ -89,15 +89,15 @@ def align_with_rotations(estimate: Trajectory, truth: Trajectory) -> Float:
 
 
 def align_scale(aligned: Float, truth: Float) -> tuple[float, float] | tuple[None, None]:
-    """Compute the scale of Umeyama's Sim(3) alignment, whose rotation is that of the alignment without scale.
+    """Compute the scale of Umeyama's Sim(3) alignment, which has the same rotation as the alignment without scale.
 
     Args:
-        aligned: (N, 3) positions after that alignment.
+        aligned: (N, 3) estimated positions after the alignment without scale.
         truth: (N, 3) true positions.
 
     Returns:
-        By how much the estimate's lengths are too long, in percent, and the rmse of positions after alignment with the
-        scale; None where the estimate stays at one place, or its scale would be negative.
+        By how much the estimate's lengths are too long, in percent, and the rmse of positions in metres after alignment
+        with the scale; None for both if the estimate stays at one place, or its scale would be negative.
     """
     from_mean, true_from_mean = aligned - aligned.mean(axis=0), truth - truth.mean(axis=0)
     along = float((from_mean * true_from_mean).sum())
@@ -109,22 +109,24 @@ def align_scale(aligned: Float, truth: Float) -> tuple[float, float] | tuple[Non
 
 
 def _nearest_rotation(correlation: Float) -> Float:
-    """Rotation R (3, 3) of maximal trace(R^T C)."""
+    """Return the rotation R (3, 3) that maximises trace(R^T C) for a matrix C (3, 3)."""
     u, _, vt = np.linalg.svd(correlation)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     return np.ascontiguousarray((u * sign) @ vt)
 
 
 def angle_between(first: Float, second: Float) -> Float:
-    """Compute angles (N,) between rotations (N, 3, 3), radians; unlike by the trace, also precise near zero."""
+    """Compute angles (N,) between rotations (N, 3, 3), radians; unlike angles from the trace, precise near zero."""
     chord = np.linalg.norm(first - second, axis=(1, 2))
     return np.asarray(2.0 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0)))
 
 
 def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, RelativeError], Float]:
-    """Compute relative errors of N poses of equal stamps: RPE by name of the distance, and those of KITTI's segments.
+    """Compute relative errors of poses with equal stamps.
 
-    The latter are percent and degrees per metre (M, 2).
+    Returns:
+        RPE by the name of the distance or duration, and errors (M, 2) of KITTI's segments: position error in percent,
+        and rotation error in degrees per metre.
     """
     seconds = (truth.stamps_ns - truth.stamps_ns[0]) / _NS_PER_S
     distances = truth.distances
@@ -152,7 +154,7 @@ def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, 
 
 
 def _pairs(along: Float, length: float) -> Int:
-    """Return indices (N, 2) of poses ``length`` apart along an increasing measure (M,), a pair for each first one."""
+    """Return indices (N, 2) of poses that are ``length`` apart along an increasing measure (M,), one per first pose."""
     goal = along + length
     after = np.clip(np.searchsorted(along, goal), 1, len(along) - 1)
     nearest = np.where(goal - along[after - 1] <= along[after] - goal, after - 1, after)
@@ -163,7 +165,7 @@ def _pairs(along: Float, length: float) -> Int:
 
 
 def _motion_errors(estimate: Trajectory, truth: Trajectory, pairs: Int) -> tuple[Float, Float]:
-    """Errors of the motions of pairs (N, 2): metres (N,) and degrees (N,)."""
+    """Compute the errors of the motions between poses with indices (N, 2): metres (N,) and degrees (N,)."""
     if not len(pairs):
         return np.empty(0), np.empty(0)
     first, last = pairs[:, 0], pairs[:, 1]

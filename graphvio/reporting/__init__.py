@@ -1,1 +1,1 @@
-"""Parts that all reports share: HTML templates, figures, and files that are whole or absent."""
+"""Functions that all reports share: HTML templates, figures, and files that are either complete or absent."""

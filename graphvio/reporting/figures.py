@@ -1,4 +1,4 @@
-"""Figures of reports: style, axes and PNG. Only matplotlib's objects are used, not the global state of pyplot."""
+"""Figures of reports: style, axes and PNG; uses only matplotlib's objects, not the global state of pyplot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def empty_figure(width_in: float, height_in: float, dpi: int = DPI) -> Figure:
 
 
 def add_axes(figure: Figure, place: tuple[float, float, float, float]) -> Any:
-    """Add axes with a grid behind the data, at left, bottom, width and height as fractions of the figure."""
+    """Add axes with a grid behind the data; ``place`` is left, bottom, width, height as fractions of the figure."""
     axes = figure.add_axes(place)
     axes.grid(**GRID)
     axes.set_axisbelow(True)
@@ -29,7 +29,7 @@ def add_axes(figure: Figure, place: tuple[float, float, float, float]) -> Any:
 
 
 def single(width_in: float, height_in: float) -> tuple[Figure, Any]:
-    """Create a figure with one pair of axes."""
+    """Create a figure with one axes object."""
     figure = empty_figure(width_in, height_in)
     return figure, add_axes(figure, (0.11, 0.16, 0.85, 0.74))
 

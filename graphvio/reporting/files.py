@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def replace_file(path: Path, content: str | bytes) -> None:
-    """Write a file under a temporary name, then rename it.
+    """Write a file under a temporary name, then rename it to ``path``.
 
     Raises:
         OSError: if it cannot be written; an existing file is then unchanged.

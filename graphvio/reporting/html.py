@@ -1,4 +1,4 @@
-"""Reports as HTML pages, from the templates that lie next to the packages that use them."""
+"""Reports as HTML pages, rendered from templates in the folders of the packages that use them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def render(template: str, **values: object) -> str:
-    """Render a template, such as ``fleet/summary.html`` in the package, with values of its variables, escaped.
+    """Render a template of the package, such as ``fleet/summary.html``; the values of its variables are escaped.
 
     Raises:
         jinja2.UndefinedError: if the template uses a variable that is not given.

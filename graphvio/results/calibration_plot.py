@@ -1,4 +1,4 @@
-"""The calibration over the time of a run, as a picture."""
+"""Plot of the estimated calibration over the time of a run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LEGEND_ROWS = 9
 
 
 class CalibrationHistory:
-    """Collects what is known of the calibration during a run, and plots it."""
+    """Collects the estimates of the calibration during a run, and plots them."""
 
     def __init__(self) -> None:
         self._curves: list[Curve] = []
@@ -29,14 +29,14 @@ class CalibrationHistory:
         self._values: list[tuple[Float, Float]] = []
 
     def add(self, stamp_ns: int, estimate: CalibrationEstimate) -> None:
-        """Add an estimate that is in force from a stamp on; stamps increase."""
+        """Add an estimate that is in force from a stamp on; stamps must increase."""
         if not self._curves:
             self._curves = curves_of(estimate.file_rig)
         self._stamps_ns.append(stamp_ns)
         self._values.append(values_of(self._curves, estimate))
 
     def plot(self, path: Path, end_ns: int, name: str = "") -> None:
-        """Plot differences from the rig file with a band of one standard deviation, a panel for each group.
+        """Plot differences from the rig file with a band of one standard deviation, one panel per group of curves.
 
         Args:
             path: image file; its suffix chooses the format.
@@ -88,9 +88,9 @@ def _plot_group(axes: Any, curves: list[Curve], seconds: Float, differences: Flo
         axes.step(seconds, value, where="post", linestyle=_STYLES[style % len(_STYLES)], label=label, **look)
     axes.axhline(0.0, color="#999999", linewidth=0.8, zorder=1)
     axes.set_xlim(0.0, max(float(seconds[-1]), 1e-3))
-    axes.set_title(curves[0].group, fontsize=10, loc="left", pad=4, y=1.0)  # given, it is not searched for
+    axes.set_title(curves[0].group, fontsize=10, loc="left", pad=4, y=1.0)  # with y given, matplotlib computes none
     axes.set_ylabel(unit.strip())
-    axes.locator_params(nbins=4)  # a tick costs matplotlib 3 ms
+    axes.locator_params(nbins=4)  # each tick costs matplotlib 3 ms
     axes.grid(color="#e2e2e2", linewidth=0.6)
     axes.set_axisbelow(True)
     rows = len(curves)

@@ -1,4 +1,4 @@
-"""Plots of a run: plan and side view of the trajectory, and its error over time where truth is available.
+"""Plots of a run: plan and side view of the trajectory, and its errors over time where the truth is available.
 
 matplotlib is used without pyplot, so that a program that plots with pyplot is not affected.
 """
@@ -48,7 +48,7 @@ def plot_run(
     evaluation: Evaluation | None = None,
     name: str = "",
 ) -> None:
-    """Plot plan (x-y) and side view (x-z) of a run in its nav frame, with coasting, losses and new epochs marked.
+    """Plot plan (x-y) and side view (x-z) of a run in nav; initialisation, coasting, losses and new epochs are marked.
 
     Args:
         path: image file; its suffix chooses the format.
@@ -56,8 +56,8 @@ def plot_run(
         status: N values of `graphvio.measurements.estimate.Status`, or empty.
         epochs: N epoch numbers, or empty; a new epoch is marked and interrupts the line.
         lost_ns: stamps of framesets without a pose.
-        truth: poses of body in any frame; plotted only together with ``evaluation``, which aligns it.
-        evaluation: of this trajectory against that truth.
+        truth: true poses of body in any frame; plotted only together with ``evaluation``, which has their alignment.
+        evaluation: evaluation of this trajectory against that truth.
         name: start of the title.
 
     Raises:
@@ -113,7 +113,11 @@ def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
 
 
 def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
-    """Plot the errors of several results, by name, against the same truth over time; the suffix chooses the format.
+    """Plot over time the errors of several results against the same truth.
+
+    Args:
+        path: image file; its suffix chooses the format.
+        evaluations: name of the result -> its evaluation.
 
     Raises:
         GraphvioError: if the file cannot be written.
@@ -152,7 +156,10 @@ def _truth_in_nav(truth: Trajectory, evaluation: Evaluation) -> Float:
 
 
 def _status_masks(status: Sequence[str], breaks: Any) -> dict[Status, Bool]:
-    """Masks (N,) of the poses of each status, including the pose before, so that the step into the status is marked."""
+    """Return a mask (N,) of the poses of each status that is marked.
+
+    It includes the pose before the status begins, so that the step to the first pose of the status is marked, too.
+    """
     masks: dict[Status, Bool] = {}
     for which in (Status.INITIALISING, Status.COASTING):
         mask = np.array([value == which for value in status], dtype=np.bool_)
@@ -206,7 +213,10 @@ def _length(metres: float) -> str:
 
 
 def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Axes, Axes]:
-    """Figure with the plan above the side view, of equal x axis and scale."""
+    """Create a figure with the plan above the side view, of equal x axis and scale.
+
+    With ``series`` there is room for `_series_axes` to the right.
+    """
     points = first if second is None else np.concatenate([first, second])
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
     centre, interval = 0.5 * (low + high), 1.12 * (high - low)
@@ -241,7 +251,7 @@ def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Axe
 
 
 def _series_axes(figure: Figure, row: int) -> Any:
-    """Axes to the right of the maps; row 0 is the lower one."""
+    """Add axes for a series over time to the right of the maps; row 0 is the lower one."""
     width, height = figure.get_size_inches()
     each = (height - _MARGIN_BOTTOM_IN - _MARGIN_TOP_IN - _GAP_IN) / 2
     left = width - _MARGIN_RIGHT_IN - _SERIES_WIDTH_IN

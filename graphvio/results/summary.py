@@ -1,4 +1,4 @@
-"""What a run hands over to its results at its end, and its figures in ``summary.json``."""
+"""The data that a run passes to its `ResultWriter` at its end, and the contents of ``summary.json``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphvio.trajectory import Trajectory, travelled
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedRun:
-    """What is known of a run at its end only, beside what its `ResultWriter` got frameset by frameset."""
+    """Data of a run that are known only at its end; all others are passed to `ResultWriter` frameset by frameset."""
 
     wall_s: float  # processing time of the whole run
     frameset_ms: Sequence[float]  # time per frameset, without decoding
@@ -24,7 +24,7 @@ class FinishedRun:
     framesets: int  # number of framesets read
     awaited: int  # number of framesets that could have had a pose: those since the IMU's first sample
     resets: int  # number of times that the estimator was reinitialised
-    warnings: Sequence[str] = ()  # what to correct before the next run, a sentence each
+    warnings: Sequence[str] = ()  # sentences on what to correct before the next run
     calibration: Sequence[str] = ()  # sentences on what the self-calibration found
     refined_rig: Rig | None = None  # the rig as calibrated at the end, written to ``rig-refined.yaml``
 
@@ -47,15 +47,15 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class PairMedians:
-    """Medians over the reports of one pair that have the figure; None where none has."""
+    """Medians of figures over the reports of one pair; None if no report has the figure."""
 
-    inliers: float | None  # points that the selected motion explains
-    rms_px: float | None  # their rms reprojection error under that motion, pixels
+    inliers: float | None  # number of points that the selected motion explains
+    rms_px: float | None  # rms reprojection error of these points under that motion, pixels
     own_rms_px: float | None  # rms reprojection error of the pair's points under its own motion, pixels
 
     @staticmethod
     def of(figures: Mapping[str, Sequence[float]]) -> PairMedians:
-        """Compute the medians of the values of each figure, by its name."""
+        """Compute the medians from the values of each figure, by the figure's name."""
         return PairMedians(**{name: _median(values) for name, values in figures.items()})
 
 
@@ -63,7 +63,7 @@ class PairMedians:
 class Summary:
     """The contents of ``summary.json``."""
 
-    framesets: int  # number of framesets of the recording, with those of which no image could be read
+    framesets: int  # number of framesets of the recording, including those of which no image could be read
     estimated: int  # number of estimates with a pose
     completion: float  # share of the framesets since the IMU's first sample that have a pose
     duration_s: float  # from the first to the last estimate, with or without a pose
@@ -78,22 +78,22 @@ class Summary:
     warnings: Sequence[str]  # what to correct before the next run, such as a rig file that the motions contradict
     calibration: Sequence[str]  # sentences on what the self-calibration found, and what the recording did not show
     status: Mapping[str, int]  # status -> number of estimates
-    pair_medians: Mapping[str, PairMedians]  # name of the pair -> its medians
-    # name of the pair -> test of tracking or stereo matching -> corners and tracks rejected by it
+    pair_medians: Mapping[str, PairMedians]  # name of the pair or single camera -> its medians
+    # name of the pair or single camera -> check of tracking or stereo matching -> corners and tracks that failed it
     pair_rejected: Mapping[str, Mapping[str, int]]
-    # of each epoch its number, first and last stamp in nanoseconds, and number of poses
+    # for each epoch: its number, first and last stamp in nanoseconds, and number of poses
     epochs: Sequence[Mapping[str, int]]
     # last estimate of the offset between cameras and IMU, or None where it is not estimated
     time_offset_s: float | None
     time_offset_sigma_s: float | None  # its standard deviation, or None
-    graphvio_version: str  # of the run
-    config_sha256: str  # of ``config.yaml``
-    evaluation: Mapping[str, Any] | None = None  # figures against the truth, or None
+    graphvio_version: str  # version with which the run was made
+    config_sha256: str  # SHA-256 of ``config.yaml``
+    evaluation: Mapping[str, Any] | None = None  # figures of the evaluation against the truth, or None
     evaluation_error: str | None = None  # why the truth could not be used, or None
 
 
 def _median(values: Sequence[float]) -> float | None:
-    """Median; None if there are no values or it is not finite."""
+    """Compute the median; None if there are no values or the median is not finite."""
     if not len(values):
         return None
     median = float(np.median(np.asarray(values)))
@@ -101,13 +101,13 @@ def _median(values: Sequence[float]) -> float | None:
 
 
 def path_length(trajectory: Trajectory, epochs: Int) -> float:
-    """Compute the path length in metres, without the steps between epochs, whose numbers are given (N,)."""
+    """Compute the path length in metres, without the steps between epochs; ``epochs`` (N,) are those of the poses."""
     parts = (trajectory.positions[epochs == epoch] for epoch in np.unique(epochs))
     return float(sum(travelled(part)[-1] for part in parts))
 
 
 def epoch_intervals(trajectory: Trajectory, epochs: Int) -> list[dict[str, int]]:
-    """List number, first and last stamp (nanoseconds) and number of poses of each epoch, given per pose (N,)."""
+    """List number, first and last stamp (ns) and number of poses of each epoch; ``epochs`` (N,) are those of poses."""
     intervals = []
     for epoch in np.unique(epochs):
         stamps = trajectory.stamps_ns[epochs == epoch]

@@ -1,7 +1,8 @@
 """Writes a result folder during a run.
 
-All files but the summary, the smoothed trajectory and the plots grow line by line and are flushed at once, so that an
-interrupted run leaves its results until then. Equal input gives an equal ``trajectory.txt``, byte by byte.
+Configuration and rig are written at the beginning; summary, smoothed trajectory, refined rig and plots at the end. All
+other files grow line by line and are flushed at each line, so that an interrupted run leaves its results up to there.
+Equal input gives an equal ``trajectory.txt``, byte by byte.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from graphvio.version import __version__
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
-"""Columns of `covariance_row`."""
+"""Header line for lines of `covariance_row`."""
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 _GRAVITY_HEADER = "stamp_ns,gravity_x,gravity_y,gravity_z,tilt_sigma"
 _CALIBRATION_HEADER = "stamp_ns,parameter,difference,sigma"
@@ -52,7 +53,7 @@ _REMEDY = "choose another place for results"
 
 
 class _Comparison(NamedTuple):
-    """Truth and evaluation of a trajectory, None where they are not asked for or failed, and why that was."""
+    """Truth and evaluation of a trajectory, None if not requested or failed, and the reason of a failure, or None."""
 
     truth: Trajectory | None = None
     evaluation: Evaluation | None = None
@@ -63,8 +64,8 @@ class ResultWriter:
     """Writes one result folder; a context manager that closes its files.
 
     Args:
-        folder: created if absent.
-        rig: written to ``rig.yaml``; reports of pairs are by their indices in it.
+        folder: result folder; created if absent.
+        rig: rig of the run, written to ``rig.yaml``; reports of pairs refer to it by index.
         config_yaml: contents of ``config.yaml``.
 
     Raises:
@@ -73,10 +74,10 @@ class ResultWriter:
 
     @staticmethod
     def new_folder(base: Path, name: str) -> Path:
-        """Create ``base/name-1``, or with the next free number; simultaneous runs get different folders.
+        """Create ``base/name-1``, or the folder with the next free number; simultaneous runs get different folders.
 
         Raises:
-            GraphvioError: if it cannot be created.
+            GraphvioError: if the folder cannot be created.
         """
         with writing(base, GraphvioError, _REMEDY):
             base.mkdir(parents=True, exist_ok=True)
@@ -210,7 +211,7 @@ class ResultWriter:
         """Write the smoothed trajectory, the refined rig, the summary and the plots.
 
         Args:
-            run: of which all estimates, calibrations and events have been added.
+            run: data of the run; all its estimates, calibrations and events must have been added before.
             truth: trajectory file or session to evaluate against; if that fails, the summary has the reason.
 
         Raises:
@@ -258,7 +259,7 @@ class ResultWriter:
         )
 
     def _write_at_end(self, run: FinishedRun, summary: Summary) -> None:
-        """Write the files that do not grow during a run."""
+        """Write the refined rig, the smoothed trajectory and the summary, which do not grow during a run."""
         if run.refined_rig is not None:
             save_rig(run.refined_rig, self.folder / "rig-refined.yaml")
         lines = (f"{tum_line(int(stamp), np.asarray(pose))}\n" for stamp, pose in run.smoothed)
@@ -267,7 +268,7 @@ class ResultWriter:
 
     def _plot(self, trajectory: Trajectory, comparison: _Comparison) -> None:
         """Plot the trajectory, and the calibration where one was estimated."""
-        name = os.fsencode(self.folder.name).decode(errors="replace")  # what is no UTF-8 cannot be plotted
+        name = os.fsencode(self.folder.name).decode(errors="replace")  # a name that is no UTF-8 cannot be plotted
         plot_run(
             self.folder / "trajectory.png",
             trajectory,
@@ -296,13 +297,13 @@ class ResultWriter:
             file.flush()
 
     def _write_at_once(self, name: str, text: str) -> None:
-        """Write a file that is either complete or absent."""
+        """Write a file in one step, so that it is either complete or absent."""
         with writing(self.folder / name, GraphvioError, _REMEDY):
             replace_file(self.folder / name, text)
 
 
 def covariance_row(stamp_ns: int, covariance: Float) -> str:
-    """Return stamp and upper triangle of a covariance (6, 6) as a line of CSV, see `COVARIANCE_HEADER`."""
+    """Return the stamp and the upper triangle of a covariance (6, 6) as a CSV line; see `COVARIANCE_HEADER`."""
     return _csv(stamp_ns, np.asarray(covariance)[_UPPER])
 
 
@@ -325,7 +326,7 @@ def _number(value: float) -> str:
 
 
 def _compare_if_possible(trajectory: Trajectory, truth: Path | None) -> _Comparison:
-    """Evaluate a trajectory, or note why that failed."""
+    """Evaluate a trajectory against the truth in a file, or return the reason why that failed."""
     if truth is None:
         return _Comparison()
     read = None

@@ -1,4 +1,4 @@
-"""One camera: its lens, its place in body, and what it shares with another one."""
+"""One camera: its lens model and its pose in body, and functions that compare two cameras."""
 
 from __future__ import annotations
 
@@ -23,27 +23,28 @@ from graphvio.rig.values import checked_transform, finite, set_value
 
 _ROUNDING = 1e-14
 _OVERLAP_DISTANCE_M = 5.0
-_GRID = 12  # points of an image, across and down
+_GRID = 12  # image points of `overlap`, across and down
 _MAX_READOUT_US = 100e3
 _MAX_STAMP_OFFSET_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One camera.
+    """A calibrated camera.
 
     Attributes:
-        name: unique in the rig, such as ``cam0``.
-        model: of the lens, one of `graphvio.cameras.MODEL_NAMES`.
-        size_px: (width, height).
+        name: name of the camera, unique in the rig, such as ``cam0``.
+        model: lens model, one of `graphvio.cameras.MODEL_NAMES`.
+        size_px: image size (width, height).
         intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
-        distortion: (8,), see `graphvio.cameras.COEFFICIENTS`; shorter input is filled with zeros.
-        body_T_cam: (4, 4), metres.
+        distortion: coefficients (8,), see `graphvio.cameras.COEFFICIENTS`; shorter input is filled with zeros.
+        body_T_cam: pose (4, 4) of the camera in body, metres.
         mask: image file whose black pixels are not used (parts of the rig or of its carrier), or None.
-        line_time_us: time from one line's exposure to the next one's, from the top, microseconds; 0 of a global
-            shutter. An image's stamp is the instant of its first line.
-        stamp_offset_s: what is added to the stamps of this camera's images, to get instants on the clock of the rig's
-            cameras: negative where they are late. Sources add it; stamps of framesets are instants.
+        line_time_us: time from the exposure of one line to that of the next, from the top, microseconds; 0 for a
+            global shutter. An image's stamp is the instant of its first line.
+        stamp_offset_s: offset that is added to the stamps of this camera's images to get instants on the common clock
+            of the rig's cameras; negative if the stamps are late. Sources add it, so that the stamps of framesets are
+            instants.
 
     Raises:
         RigError: if a value has the wrong shape, is not finite or out of range.
@@ -93,14 +94,14 @@ class Camera:
     def focal_px(self) -> float:
         """Scale from normalised image units to pixels at the image centre, the mean of both axes.
 
-        It is not that of `intrinsics` where the lens has a sphere that is off the centre.
+        For lens models with ``xi`` it is the focal length in `intrinsics` divided by ``1 + xi``.
         """
         mean = float(0.5 * (self.intrinsics[0] + self.intrinsics[1]))
         return mean * central_scale(self.model_number, self.distortion)
 
     @property
     def readout_ns(self) -> int:
-        """Time from the first line's exposure to the last one's, nanoseconds; 0 of a global shutter."""
+        """Time from the exposure of the first line to that of the last, nanoseconds; 0 for a global shutter."""
         return round(1e3 * self.line_time_us * (self.size_px[1] - 1))
 
     @property
@@ -115,11 +116,11 @@ class Camera:
 
     @property
     def model_number(self) -> int:
-        """Number of the model in the kernels of `graphvio.cameras`."""
+        """Number of the lens model, as the kernels of `graphvio.cameras` take it."""
         return MODEL_NAMES[self.model]
 
     def project(self, points: Float) -> tuple[Float, Bool]:
-        """Project points.
+        """Project points to pixels.
 
         Args:
             points: (N, 3) in the camera frame, metres.
@@ -132,10 +133,10 @@ class Camera:
         return pixels, valid & self.contains(pixels)
 
     def unproject(self, pixels: Float) -> tuple[Float, Bool]:
-        """Unproject pixels.
+        """Compute the rays of pixels.
 
         Args:
-            pixels: (N, 2), the centre of the first is (0, 0).
+            pixels: (N, 2); the centre of the first pixel is (0, 0).
 
         Returns:
             Normalised coordinates (N, 2) ``[X / Z, Y / Z]``, and whether each pixel has a ray (N,).
@@ -147,11 +148,11 @@ class Camera:
         """Test whether pixels are inside the image.
 
         Args:
-            pixels: (N, 2), the centre of the first is (0, 0).
-            border_px: least distance from the edge.
+            pixels: (N, 2); the centre of the first pixel is (0, 0).
+            border_px: least distance from the image's edge, pixels.
 
         Returns:
-            Whether each is (N,).
+            Whether each pixel is inside (N,).
         """
         width, height = self.size_px
         x, y = pixels[:, 0], pixels[:, 1]
@@ -160,12 +161,12 @@ class Camera:
 
 
 def axes_angle_deg(left: Camera, right: Camera) -> float:
-    """Compute the angle between the optical axes of two cameras."""
+    """Compute the angle between the optical axes of two cameras, degrees."""
     return float(np.rad2deg(np.arccos(np.clip((right.cam_T_body @ left.body_T_cam)[2, 2], -1.0, 1.0))))
 
 
 def overlap(left: Camera, right: Camera) -> float:
-    """Compute the share of the left image that shows points, 5 m away, which the right camera sees too."""
+    """Compute the share of the left image whose points, taken at a depth of 5 m, the right camera sees too."""
     width, height = left.size_px
     u, v = np.meshgrid((np.arange(_GRID) + 0.5) / _GRID * width, (np.arange(_GRID) + 0.5) / _GRID * height)
     rays, has_ray = left.unproject(np.column_stack([u.ravel(), v.ravel()]))
@@ -176,10 +177,10 @@ def overlap(left: Camera, right: Camera) -> float:
 
 
 def as_written(camera: Camera, body_T_cam: Float) -> Camera:
-    """Restore the exact digits of the transform (4, 4) in a camera that was read from a file.
+    """Restore the exact digits of the transform (4, 4) of a camera that was read from a file.
 
-    The constructor orthonormalises rotations, which may change the last digit. A transform that differs by more than
-    rounding stays as the constructor made it.
+    The constructor orthonormalises rotations, which may change the last digit. If the given transform differs from the
+    constructor's by more than rounding, the camera keeps the latter.
     """
     given = np.array(body_T_cam, dtype=np.float64)
     if np.abs(given - camera.body_T_cam).max() <= _ROUNDING:

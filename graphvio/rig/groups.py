@@ -13,9 +13,9 @@ from graphvio.rig.camera import Camera, axes_angle_deg
 
 _MAX_READOUT_DIFFERENCE_NS = 1_000_000
 MAX_AXES_ANGLE_DEG = 45.0
-"""Between the cameras of a stereo pair: with more, patches look too different."""
+"""Largest angle between the optical axes of a stereo pair; at larger ones, patches look too different to be matched."""
 MIN_BASELINE_M = 1e-3
-"""Between these cameras."""
+"""Smallest distance between the optical centres of a stereo pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,9 @@ class StereoPair:
     """Left and right camera with overlapping views.
 
     Attributes:
-        name: unique in the rig.
+        name: name of the pair, unique in the rig.
         left: the camera whose corners are tracked.
-        right: the camera in which they are matched.
+        right: the camera in whose images these corners are matched.
 
     Raises:
         RigError: if the baseline is below 1 mm, the optical axes are more than 45 degrees apart, or rolling shutters
@@ -73,10 +73,10 @@ class StereoPair:
 
 @dataclass(frozen=True, eq=False)
 class SingleCamera:
-    """A camera without a stereo partner: the depth of its points comes from motion.
+    """A camera without a stereo partner; the depth of its points is estimated from motion.
 
     Attributes:
-        left: the camera, whose corners are tracked as those of a pair's left camera are.
+        left: the camera; its corners are tracked like those of a pair's left camera.
     """
 
     left: Camera
@@ -93,4 +93,4 @@ class SingleCamera:
 
 
 CameraGroup = StereoPair | SingleCamera
-"""Cameras whose images are tracked together: two, or one."""
+"""Cameras whose images are tracked together: a stereo pair, or a single camera."""

@@ -19,15 +19,16 @@ class Imu:
     """The inertial sensor; its frame is body.
 
     Attributes:
-        rate_hz: nominal rate.
-        gyro_noise_density: white noise, rad/s/sqrt(Hz).
-        gyro_random_walk: bias diffusion, rad/s^2/sqrt(Hz).
-        accel_noise_density: white noise, m/s^2/sqrt(Hz).
-        accel_random_walk: bias diffusion, m/s^3/sqrt(Hz).
-        time_offset_s: ``t_imu = t_cam + time_offset``, Kalibr's ``timeshift_cam_imu``; ``t_cam`` is the stamp of an
-            image plus the ``stamp_offset_s`` of its camera.
-        gyro_matrix: (3, 3) by rows, scale and misalignment: angular velocities are multiplied by it.
-        accel_matrix: (3, 3) by rows, the same for specific forces.
+        rate_hz: nominal sample rate.
+        gyro_noise_density: white noise of the gyro, rad/s/sqrt(Hz).
+        gyro_random_walk: random walk of the gyro's bias, rad/s^2/sqrt(Hz).
+        accel_noise_density: white noise of the accelerometer, m/s^2/sqrt(Hz).
+        accel_random_walk: random walk of the accelerometer's bias, m/s^3/sqrt(Hz).
+        time_offset_s: offset of the IMU's clock, ``t_imu = t_cam + time_offset`` (Kalibr's ``timeshift_cam_imu``);
+            ``t_cam`` is the stamp of an image plus the ``stamp_offset_s`` of its camera.
+        gyro_matrix: scale and misalignment of the gyro, (3, 3) by rows; measured angular velocities are multiplied by
+            it.
+        accel_matrix: the same for measured specific forces.
 
     Raises:
         RigError: if the rate or a density is not positive, a value is not finite, or a matrix is not near the identity.
@@ -70,7 +71,7 @@ class Imu:
 
     @property
     def has_matrices(self) -> bool:
-        """Whether readings have to be multiplied by a matrix."""
+        """Whether `gyro_matrix` or `accel_matrix` is not the identity, so that readings have to be multiplied."""
         return self.gyro_matrix != _IDENTITY or self.accel_matrix != _IDENTITY
 
     @property

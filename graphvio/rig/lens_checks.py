@@ -1,4 +1,4 @@
-"""What is wrong with a lens as a file describes it: coefficients out of range, or an image that it cannot make."""
+"""Plausibility checks of a lens from a file: coefficients, intrinsics, and whether rays reach the image's corners."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS, EQUIDISTANT, MODEL_NAMES, RADIAL_TANGENTIAL, ray_of
 
 _ROUNDING = 1e-6
-_FOCAL_RANGE = (0.05, 57.3)  # of the image's larger side: from wider than any lens to a view of one degree
-_MAX_OUTSIDE = 0.25  # of the image's side; what remains of a larger image may have its principal point outside
+_FOCAL_RANGE = (0.05, 57.3)  # fraction of the image's larger side: wider than any lens, and a view of one degree
+_MAX_OUTSIDE = 0.25  # fraction of the image's side; the principal point of a cropped image may lie outside of it
 
 
 def lens_fault(model: str, distortion: Float) -> str:
-    """Say what is wrong with coefficients, and what to do; empty if nothing is.
+    """Return a message on distortion coefficients that are out of range, with the remedy, or an empty string.
 
     Args:
-        model: its name.
-        distortion: (8,).
+        model: name of the lens model.
+        distortion: coefficients (8,).
     """
     names = COEFFICIENTS[model]
     order = f"give {model} the coefficients {', '.join(names)} in this order"
@@ -38,12 +38,12 @@ def lens_fault(model: str, distortion: Float) -> str:
 
 
 def intrinsics_fault(focal_px: float, intrinsics: Float, size_px: tuple[int, int]) -> str:
-    """Say which intrinsics are of no lens, such as those in other units than pixels; empty if they are plausible.
+    """Return a message on intrinsics that no lens has, such as those in other units than pixels, or an empty string.
 
     Args:
-        focal_px: scale at the image centre.
+        focal_px: `Camera.focal_px`, the scale at the image centre.
         intrinsics: (4,) pixels.
-        size_px: (width, height).
+        size_px: image size (width, height).
     """
     width, height = size_px
     cx, cy = intrinsics[2:].tolist()
@@ -56,13 +56,13 @@ def intrinsics_fault(focal_px: float, intrinsics: Float, size_px: tuple[int, int
 
 
 def view_fault(model: str, intrinsics: Float, distortion: Float, size_px: tuple[int, int]) -> str:
-    """Say which corner of the image no ray reaches by the model, however wide, and what to do; empty if there is none.
+    """Return a message on an image corner that no ray reaches, at any angle, with the remedy, or an empty string.
 
     Args:
-        model: its name; with ``radial-tangential`` and ``equidistant`` nothing is tested.
+        model: name of the lens model; with ``radial-tangential`` and ``equidistant`` nothing is tested.
         intrinsics: (4,) pixels.
-        distortion: (8,).
-        size_px: (width, height).
+        distortion: coefficients (8,).
+        size_px: image size (width, height).
     """
     number = MODEL_NAMES[model]
     if number in (RADIAL_TANGENTIAL, EQUIDISTANT):

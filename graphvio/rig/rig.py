@@ -1,4 +1,4 @@
-"""The whole rig, and rigs of a part of its sensors."""
+"""The whole rig, and methods that select, remove or change its sensors."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from graphvio.rig.values import set_value
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-_MAX_DISTANCE_M = 20.0  # of cameras of one rig, and from its IMU
+_MAX_DISTANCE_M = 20.0  # between the cameras of a pair, and between a camera and the IMU
 _IN_METRES = "translations are in metres: if these are in millimetres, divide them by 1000"
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Stereo pairs, cameras without a partner, and at most one IMU.
+    """Stereo pairs, single cameras, and at most one IMU.
 
     Attributes:
-        pairs: none where there are only single cameras, whose scale an IMU shows.
-        imu: None for vision only.
-        name: used in messages and results.
-        calibration_sigmas: how far the calibration is known.
-        singles: cameras without a partner.
+        pairs: stereo pairs; empty for a rig of single cameras, which gets its scale from the IMU.
+        imu: the IMU, or None for vision only.
+        name: name of the rig in messages and results.
+        calibration_sigmas: standard deviations of the calibration.
+        singles: cameras without a stereo partner.
 
     Raises:
         RigError: if there is no camera, or neither a pair nor an IMU, or if two cameras, or two groups of cameras,
@@ -64,20 +64,20 @@ class Rig:
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """All cameras: left and right of the first pair, then of the second, and so on; then single ones."""
+        """All cameras: left and right of the first pair, then of the second, and so on; then the single cameras."""
         return tuple(camera for group in self.groups for camera in group.cameras)
 
     @property
     def groups(self) -> tuple[CameraGroup, ...]:
-        """Pairs, then cameras without a partner: the indices of `graphvio.measurements.sensors.FrameSet.images`."""
+        """Pairs, then single cameras; `graphvio.measurements.sensors.FrameSet.images` has their indices as keys."""
         return (*self.pairs, *self.singles)
 
     def left2_T_left1(self, first: int = 0, second: int = 1) -> Float:
-        """Transform from one pair's left camera to another's.
+        """Return the transform from the left camera of one pair to that of another.
 
         Args:
-            first: index of the one pair.
-            second: index of the other.
+            first: index of the pair to transform from.
+            second: index of the pair to transform to.
 
         Returns:
             ``left2_T_left1`` (4, 4), ``P_12`` of the paper's eq. (1).
@@ -85,10 +85,10 @@ class Rig:
         return self.pairs[second].left.cam_T_body @ self.pairs[first].left.body_T_cam
 
     def with_pairs(self, indices: Sequence[int]) -> Rig:
-        """Select pairs of the rig, without cameras that have no partner.
+        """Select pairs of the rig; single cameras are left out.
 
         Args:
-            indices: of the pairs, in the order wanted.
+            indices: indices of the pairs, in the order wanted.
 
         Returns:
             The rig of these pairs.
@@ -106,10 +106,10 @@ class Rig:
         return replace(self, pairs=tuple(self.pairs[i] for i in indices), singles=())
 
     def with_only(self, cameras: Sequence[str]) -> Rig:
-        """Select cameras of the rig: pairs of which both are selected stay pairs, others become single cameras.
+        """Select cameras of the rig; a pair stays one if both its cameras are selected, others become single cameras.
 
         Args:
-            cameras: names; a number N is short for ``camN``.
+            cameras: names of the cameras; a number N is short for ``camN``.
 
         Returns:
             The rig of these cameras.
@@ -135,10 +135,10 @@ class Rig:
         return replace(self, pairs=(), singles=tuple(SingleCamera(camera) for camera in self.cameras))
 
     def need_pairs(self, user: str) -> None:
-        """Refuse a rig of single cameras only.
+        """Raise an error if the rig has no stereo pair.
 
         Args:
-            user: what needs a stereo pair.
+            user: the command or function that needs a stereo pair, for the message.
 
         Raises:
             RigError: if there is none.
@@ -151,18 +151,18 @@ class Rig:
             )
 
     def without_imu(self) -> Rig:
-        """Drop the IMU.
+        """Return the rig without its IMU.
 
         Returns:
-            The rig without it.
+            The rig, for vision only.
 
         Raises:
-            RigError: if no pair is left that shows the scale.
+            RigError: if the rig has no stereo pair, so that the scale would be unknown.
         """
         return replace(self, imu=None)
 
     def without_stamp_offsets(self) -> Rig:
-        """Return the rig for images whose stamps are corrected already, as those of framesets are."""
+        """Return the rig with stamp offsets of 0, for images whose stamps are corrected already, as in framesets."""
 
         def corrected(camera: Camera) -> Camera:
             if camera.stamp_offset_s == 0.0:
@@ -172,10 +172,10 @@ class Rig:
         return self.with_cameras(corrected)
 
     def with_cameras(self, change: Callable[[Camera], Camera]) -> Rig:
-        """Replace each camera by what a function makes of it.
+        """Replace each camera by the result of a function.
 
         Args:
-            change: returns the camera to be used instead.
+            change: takes a camera, and returns the one to be used instead.
 
         Returns:
             The rig with these cameras.
@@ -186,12 +186,13 @@ class Rig:
 
 
 def checked_views(rig: Rig) -> Rig:
-    """Return a rig that was read from a file, after a test of what no real one has, such as values in other units.
+    """Check a rig that was read from a file for values that no real rig has, such as those in other units; return it.
 
-    Lenses must reach all of their images, unless there is a mask: images of a fisheye may have black corners.
+    Rays must reach all corners of an image, unless the camera has a mask: images of a fisheye may have black corners.
 
     Raises:
-        RigError: if a lens does not, its intrinsics are of none, or cameras are tens of metres apart.
+        RigError: if a corner is not reached, intrinsics are implausible, or the cameras of a pair, or a camera and the
+            IMU, are more than 20 m apart.
     """
     for camera in rig.cameras:
         fault = intrinsics_fault(camera.focal_px, camera.intrinsics, camera.size_px)

@@ -1,4 +1,4 @@
-"""Values of frozen objects: arrays and rigid transforms, checked and converted."""
+"""Checks and conversions of the values of frozen objects: arrays and rigid transforms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def checked_transform(matrix: object, where: str) -> Float:
     """Validate a rigid transform and orthonormalise its rotation.
 
     Args:
-        matrix: (4, 4).
+        matrix: transform, array-like (4, 4).
         where: start of the error message.
 
     Raises:
@@ -36,15 +36,15 @@ def checked_transform(matrix: object, where: str) -> Float:
 
 
 def finite(values: object, shape: tuple[int, ...], where: str) -> Float:
-    """Convert numbers to an array.
+    """Convert numbers to an array, and check shape and finiteness.
 
     Args:
         values: array-like.
-        shape: that they must have.
+        shape: required shape.
         where: start of the error message.
 
     Raises:
-        RigError: if they are no numbers, of another shape, or not finite.
+        RigError: if the values are no numbers, of another shape, or not finite.
     """
     try:
         array = np.array(values, dtype=np.float64)

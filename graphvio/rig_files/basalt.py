@@ -1,8 +1,8 @@
-"""Basalt's ``calibration.json``: cameras, their places in the IMU's frame, and the IMU.
+"""Reader of Basalt's ``calibration.json``: cameras with their poses in the IMU's frame, and the IMU.
 
-``T_imu_cam`` is ``body_T_cam``. The IMU's noise is that of continuous time, a density. Its calibrated reading is
+``T_imu_cam`` is ``body_T_cam``. The IMU's noise values are continuous-time densities. A calibrated reading is
 ``(I + S) raw - bias``: ``I + S`` is graphvio's matrix of the sensor, and the bias is left out, because graphvio
-estimates it. ``cam_time_offset_ns`` is added to the cameras' stamps, so it has the sign of ``time_offset_s``.
+estimates it. Basalt adds ``cam_time_offset_ns`` to the cameras' stamps, so it has the sign of ``time_offset_s``.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "eucm": ("extended-unified", COEFFICIENTS["extended-unified"]),
     "ucm": ("extended-unified", ("alpha",)),
 }
-"""``camera_type`` -> graphvio's name, and the coefficients that the file has."""
+"""``camera_type`` -> graphvio's name of the lens model, and the names of the coefficients in the file."""
 _NOISE = dict(zip(NOISE_KEYS, ("gyro_noise_std", "gyro_bias_std", "accel_noise_std", "accel_bias_std"), strict=True))
 
 
 def is_calibration(path: Path) -> bool:
-    """Return whether a file is one of Basalt's calibrations, as far as its keys show."""
+    """Return whether a file has the keys of a calibration by Basalt."""
     try:
         values = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
@@ -45,10 +45,10 @@ def is_calibration(path: Path) -> bool:
 
 
 def load(path: Path) -> Rig:
-    """Read a calibration; cameras 0 and 1 form the first pair, 2 and 3 the next.
+    """Read a calibration; cameras are grouped into pairs by `grouped_rig`.
 
     Raises:
-        RigError: if it cannot be read or lacks a value, or does not describe a usable rig.
+        RigError: if the file cannot be read or lacks a value, or does not describe a usable rig.
     """
     try:
         values = json.loads(read_text(path))
@@ -103,12 +103,12 @@ def _imu(document: Section) -> Imu:
     noise = document.noise("imu_update_rate", {})
     for name, key in _NOISE.items():
         given = document.get(key)
-        noise[name] = float(document.array(key, None if isinstance(given, list) else ()).max())  # of the axes
+        noise[name] = float(document.array(key, None if isinstance(given, list) else ()).max())  # the noisiest axis
     if document.values.get("calib_gyro_bias") is not None:
-        scale = document.array("calib_gyro_bias", (12,))[3:].reshape(3, 3).T  # by columns
+        scale = document.array("calib_gyro_bias", (12,))[3:].reshape(3, 3).T  # stored by columns
         noise["gyro_matrix"] = tuple((np.eye(3) + scale).ravel().tolist())
     if document.values.get("calib_accel_bias") is not None:
         scale = np.zeros((3, 3))
-        scale.T[np.triu_indices(3)] = document.array("calib_accel_bias", (9,))[3:]  # lower triangle, by columns
+        scale.T[np.triu_indices(3)] = document.array("calib_accel_bias", (9,))[3:]  # lower triangle, stored by columns
         noise["accel_matrix"] = tuple((np.eye(3) + scale).ravel().tolist())
     return Imu(**noise, time_offset_s=1e-9 * document.number("cam_time_offset_ns", 0.0))

@@ -1,8 +1,8 @@
-"""COLMAP's ``rig_config.json`` with the ``cameras.txt`` next to it.
+"""Reader of COLMAP's ``rig_config.json`` with the ``cameras.txt`` next to it.
 
-The configuration has the cameras' places in the rig, ``cam_from_rig``: a quaternion w x y z, and a translation
-(metres). Image sizes are only in ``cameras.txt``, a part of COLMAP's text model; so are the lenses, unless the
-configuration has them. The centre of the first pixel is (0.5, 0.5) there.
+The configuration has the extrinsics ``cam_from_rig`` of each camera: a quaternion w x y z, and a translation (metres).
+Image sizes are only in ``cameras.txt``, a part of COLMAP's text model; so are the lenses, unless the configuration has
+them. In COLMAP the centre of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import Section, named, read_text
 
 CAMERAS_FILE = "cameras.txt"
-_MODELS: dict[str, tuple[str, int, tuple[int, ...]]] = {  # graphvio's name, focal lengths, places of the coefficients
+_MODELS: dict[str, tuple[str, int, tuple[int, ...]]] = {  # graphvio's name, number of focal lengths, coefficients
     "SIMPLE_PINHOLE": ("radial-tangential", 1, ()),
     "PINHOLE": ("radial-tangential", 2, ()),
     "SIMPLE_RADIAL": ("radial-tangential", 1, (0,)),
@@ -50,10 +50,10 @@ class _Lens(NamedTuple):
 def load(path: Path) -> Rig:
     """Read the only rig of a configuration; it has no IMU, and body is the reference camera.
 
-    Of cameras without a ``camera_id`` the first is camera 1 of ``cameras.txt``, and so on.
+    A camera without a ``camera_id`` is the one of ``cameras.txt`` whose number is its position in the list, from 1.
 
     Args:
-        path: of a file for which `is_config` is true.
+        path: configuration for which `is_config` is true.
 
     Raises:
         RigError: if a file cannot be read or lacks a value, or does not describe a usable rig.
@@ -70,7 +70,7 @@ def load(path: Path) -> Rig:
 
 
 def is_config(path: Path) -> bool:
-    """Return whether a file is a rig configuration, as far as its keys show."""
+    """Return whether a file has the keys of a rig configuration."""
     try:
         values = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
@@ -110,7 +110,7 @@ def _camera(section: Section, lenses: Mapping[int, _Lens], number: int) -> Camer
 
 
 def _name(section: Section, number: int) -> str:
-    """Return the last folder of the prefix of a camera's images."""
+    """Return a camera's name: the last folder of ``image_prefix``, ``data`` aside, or ``cam0``, ``cam1`` ..."""
     prefix = str(section.values.get("image_prefix") or "")
     parts = [part for part in prefix.split("/") if part and part != "data"]
     return parts[-1] if parts else f"cam{number - 1}"
@@ -125,7 +125,7 @@ def _rig_T_cam(section: Section) -> Float:
 
 
 def _lenses(path: Path) -> dict[int, _Lens]:
-    """Read ``cameras.txt``: number, model, width, height and parameters in each line."""
+    """Read ``cameras.txt``, with number, model, width, height and parameters in each line; keys are the numbers."""
     if not path.is_file():
         raise RigError(
             f"{path}: does not exist; COLMAP's rig configuration has no image sizes: write the text model's "

@@ -1,7 +1,7 @@
-"""Calibration of an EuRoC/ASL folder: ``cam0/sensor.yaml``, ``cam1/sensor.yaml`` ..., ``imu0/sensor.yaml``.
+"""Reader of an EuRoC/ASL folder's calibration: ``cam0/sensor.yaml``, ``cam1/sensor.yaml`` ..., ``imu0/sensor.yaml``.
 
-``T_BS`` is the pose of the sensor in the file's body frame. Where the IMU's is not the identity, all extrinsics are
-transformed to the IMU's frame, which is graphvio's body. TUM-VI exports have the same folders but may have the
+``T_BS`` is the pose of the sensor in the file's body frame. If the IMU's ``T_BS`` is not the identity, all extrinsics
+are transformed to the IMU's frame, which is graphvio's body. TUM-VI exports have the same folders but may have the
 calibration in ``dso/camchain.yaml`` and ``dso/imu_config.yaml`` next to ``mav0``.
 """
 
@@ -27,9 +27,12 @@ _CAMERA_KEYS = ("T_BS", "resolution", "intrinsics", "distortion_model", "distort
 
 
 def load(path: Path) -> Rig:
-    """Read the calibration in ``mav0`` or the folder that contains it.
+    """Read the calibration of a recording.
 
-    Cameras form pairs by `grouped_rig`. Without a folder ``imu0`` the rig has no IMU.
+    Cameras are grouped into pairs by `grouped_rig`. Without a folder ``imu0`` the rig has no IMU.
+
+    Args:
+        path: ``mav0``, or the folder that contains it.
 
     Raises:
         RigError: if a file or value is missing, or they do not describe a usable rig.
@@ -66,12 +69,12 @@ def sensors_folder(path: Path) -> Path | None:
 
 
 def has_calibration(sensors: Path) -> bool:
-    """Whether a folder of sensors has a calibration of its own: any ``sensor.yaml``, or TUM-VI's chain."""
+    """Return whether a folder of sensors holds a calibration: any ``sensor.yaml``, or TUM-VI's chain next to it."""
     return any(sensors.glob("*/sensor.yaml")) or (sensors.parent / _CHAIN).is_file()
 
 
 def camera_folders(root: Path) -> list[Path]:
-    """List the folders ``cam0``, ``cam1`` ... by number."""
+    """List the folders ``cam0``, ``cam1`` ... in the order of their numbers."""
     if not root.is_dir():
         return []
     folders = [p for p in root.iterdir() if re.fullmatch(r"cam\d+", p.name) and p.is_dir()]
@@ -107,13 +110,13 @@ def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
 
 def _sensor(folder: Path) -> Section:
     file = folder / "sensor.yaml"
-    if not file.is_file():  # the error then names the first value that is missing
+    if not file.is_file():  # the first value that is read then raises an error with its name
         return Section({}, file)
     return read_yaml(file)
 
 
 def _is_complete(section: Section) -> bool:
-    has_sphere = section.values.get("camera_model") in kalibr.SPHERES  # and may be without distortion
+    has_sphere = section.values.get("camera_model") in kalibr.SPHERES  # these models may have no distortion
     required = _CAMERA_KEYS[:3] if has_sphere else _CAMERA_KEYS
     return all(section.values.get(key) not in (None, [], "") for key in required)
 

@@ -1,4 +1,4 @@
-"""Which cameras of a calibration form stereo pairs: those whose views overlap."""
+"""Grouping of a calibration's cameras into stereo pairs, by the overlap of their views."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ _MIN_OVERLAP = 0.25
 
 
 def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Path) -> Rig:
-    """Form a rig of cameras in a file's order: pairs (0, 1), (2, 3) and so on if each of them overlaps.
+    """Form a rig of the cameras of a file: pairs (0, 1), (2, 3) and so on if the views of each overlap by a quarter.
 
-    Otherwise the cameras that overlap most form pairs, and the others are single cameras; with an IMU, all may be. Two
-    cameras with an IMU are a pair unless they share no view.
+    Otherwise the cameras that overlap most form pairs, and the others are single cameras; with an IMU, all of them may
+    be single cameras. Two cameras always form a pair, unless there is an IMU and their views do not overlap at all or
+    their optical axes are more than 45 degrees apart.
 
     Args:
-        cameras: of the file.
-        imu: of the rig, or None.
-        name: of the rig.
-        path: of the file, for messages.
+        cameras: the cameras, in the order of the file.
+        imu: the rig's IMU, or None.
+        name: name of the rig.
+        path: path of the file, for messages.
 
     Raises:
         RigError: if no two cameras overlap and there is no IMU, or the cameras do not describe a usable rig.
@@ -67,15 +68,15 @@ def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Pat
 
 
 def _look_apart(one: Camera, other: Camera) -> bool:
-    """Whether two cameras cannot be a pair, as they share no view or look too different ways."""
+    """Return whether two cameras cannot be a pair: their views do not overlap, or their axes are too far apart."""
     return axes_angle_deg(one, other) > MAX_AXES_ANGLE_DEG or overlap(one, other) == 0.0
 
 
 def _overlapping(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Match cameras that overlap and look nearly the same way, the most overlapping first, each at most once.
+    """Match cameras whose views overlap and whose axes are nearly parallel, largest overlap first, each at most once.
 
     Raises:
-        RigError: if two cameras are at one place.
+        RigError: if two cameras have the same pose.
     """
     shares = {(i, j): overlap(cameras[i], cameras[j]) for i, j in combinations(range(len(cameras)), 2)}
     for i, j in shares:

@@ -1,4 +1,4 @@
-"""Joins calibrations of several pairs, which share no view and so are calibrated one by one, to one rig."""
+"""Joins the calibrations of several rigs, which share no view and so are calibrated one by one, to one rig."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from graphvio.rig_files.time_shifts import MAX_DIFFERENCE_S, STAMP_DECIMALS
 
 
 def joined_rig(rigs: Sequence[Rig], name: str) -> tuple[Rig, tuple[str, ...]]:
-    """Join rigs to one, whose body and IMU are the first one's.
+    """Join rigs to one, with the body frame and the IMU of the first rig.
 
-    Rigs with an IMU are taken to have the same one, so that the places of their cameras are known. Of a rig without
-    it the place is guessed, for `graphvio calibrate` to find: at the first left camera, turned about its vertical by
-    equal steps, so that two look forwards and backwards. Where names repeat, cameras are named ``cam0``, ``cam1`` and
-    so on in the order of the rigs, and pairs ``pair0``, ``pair1`` ...
+    All rigs with an IMU are taken to have the same one, so that the poses of their cameras in body are known. The pose
+    of a rig without an IMU is a guess, to be estimated by `graphvio calibrate`: its first camera is put at the position
+    of the first rig's first camera, and turned about that camera's y axis by equal steps, so that of two rigs one looks
+    forwards and one backwards. Where names repeat, cameras are named ``cam0``, ``cam1`` and so on in the order of the
+    rigs, and pairs ``pair0``, ``pair1`` ...
 
-    Where time offsets to the IMU differ by more than 5 ms, rigs are not triggered together: the first one's offset is
-    the IMU's, and by the others' differences from it the stamps of their cameras are corrected.
+    Where the time offsets of the rigs differ by more than 5 ms, they are taken as not triggered together: the IMU keeps
+    the time offset of the first rig, and the stamps of the other rigs' cameras are corrected by the difference.
 
     Args:
-        rigs: at least one.
-        name: of the rig.
+        rigs: the rigs, at least one.
+        name: name of the joined rig.
 
     Returns:
-        The rig, and the names of the pairs and single cameras whose place is guessed.
+        The rig, and the names of the pairs and single cameras whose pose is a guess.
 
     Raises:
         RigError: if only a later rig has an IMU.
@@ -53,7 +54,7 @@ def joined_rig(rigs: Sequence[Rig], name: str) -> tuple[Rig, tuple[str, ...]]:
 
 
 def _on_one_clock(rigs: Sequence[Rig]) -> Sequence[Rig]:
-    """Correct the stamps of cameras to the clock of the first rig's, where time offsets to the IMU differ."""
+    """Correct the stamps of all rigs to the clock of the first rig's cameras, if time offsets to the IMU differ."""
     offsets_s = [rig.imu.time_offset_s if rig.imu is not None else None for rig in rigs]
     known_s = [offset_s for offset_s in offsets_s if offset_s is not None]
     if not known_s or max(known_s) - min(known_s) <= MAX_DIFFERENCE_S:
@@ -65,14 +66,14 @@ def _on_one_clock(rigs: Sequence[Rig]) -> Sequence[Rig]:
 
 
 def _later(rig: Rig, seconds: float) -> Rig:
-    """Return a rig whose cameras' corrected stamps are so much later."""
+    """Return a rig with the given seconds added to the stamp offset of each camera."""
     return rig.with_cameras(
         lambda camera: replace(camera, stamp_offset_s=round(camera.stamp_offset_s + seconds, STAMP_DECIMALS))
     )
 
 
 def _turned(rig: Rig, first: Rig, share: float) -> Rig:
-    """Put a rig's first camera at another one's place, turned about that camera's vertical by a share of a turn."""
+    """Put a rig at the first camera of another one, turned about that camera's y axis by a share of a full turn."""
     left0_R_left = so3_exp(np.array([0.0, 2.0 * np.pi * share, 0.0]))
     body_T_left = first.cameras[0].body_T_cam @ se3(left0_R_left, np.zeros(3))
     body_T_body = body_T_left @ se3_inverse(rig.cameras[0].body_T_cam)
@@ -80,7 +81,7 @@ def _turned(rig: Rig, first: Rig, share: float) -> Rig:
 
 
 def _named_apart(groups: Sequence[CameraGroup]) -> list[CameraGroup]:
-    """Return groups of different names, with cameras of different names."""
+    """Return the groups with unique names; cameras, or pairs, are renamed only if any of their names repeat."""
     cameras = [camera.name for group in groups for camera in group.cameras]
     is_renamed = len(set(cameras)) < len(cameras)
     is_pair_renamed = len({group.name for group in groups}) < len(groups)

@@ -1,9 +1,9 @@
-"""Kalibr's ``camchain-imucam.yaml`` with the ``imu.yaml`` next to it, and a camera-only ``camchain.yaml``.
+"""Reader of Kalibr's ``camchain-imucam.yaml`` with the ``imu.yaml`` next to it, or a camera-only ``camchain.yaml``.
 
 Kalibr's ``T_cam_imu`` maps points from the IMU's frame to the camera's, so ``body_T_cam`` is its inverse;
-``timeshift_cam_imu`` has graphvio's sign, ``t_imu = t_cam + timeshift``. ``intrinsics`` are ``[fu, fv, pu, pv]``, and
-before them ``[xi, alpha]`` for the camera model ``ds``, ``[alpha, beta]`` for ``eucm`` and ``[xi]`` for ``omni``.
-OpenVINS has the same files with ``T_imu_cam``, which is ``body_T_cam``, and the IMU's matrices by other names.
+``timeshift_cam_imu`` has graphvio's sign, ``t_imu = t_cam + timeshift``. ``intrinsics`` are ``[fu, fv, pu, pv]``,
+preceded by ``[xi, alpha]`` for the camera model ``ds``, ``[alpha, beta]`` for ``eucm`` and ``[xi]`` for ``omni``.
+OpenVINS has the same files with ``T_imu_cam``, which is ``body_T_cam``, and other names for the IMU's matrices.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ LINE_DELAY_KEY = "line_delay"
 """Seconds from one line of a rolling shutter to the next."""
 _TIME_SHIFT_KEY = "timeshift_cam_imu"
 _PLACE_KEYS = ("T_cam_imu", "T_imu_cam")
-"""Of a camera's place in the IMU's frame: Kalibr's, and OpenVINS's inverse of it."""
+"""Keys of a camera's extrinsics: Kalibr's, and OpenVINS's, which is the inverse."""
 _MIN_DETERMINANT = 1e-3
 
 
 def load(path: Path) -> Rig:
-    """Read a camera chain, and if it has ``T_cam_imu`` the IMU's file from the same folder.
+    """Read a camera chain, and the IMU's file from the same folder if the chain has extrinsics to an IMU.
 
-    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without ``T_cam_imu`` or OpenVINS's ``T_imu_cam`` the rig has
-    no IMU, and body is cam0.
+    Cameras are grouped into pairs by `grouped_rig`. Without ``T_cam_imu`` or OpenVINS's ``T_imu_cam`` the rig has no
+    IMU, and body is cam0.
 
     Raises:
-        RigError: if a file cannot be read or lacks a value, or they do not describe a usable rig.
+        RigError: if a file cannot be read or lacks a value, or the files do not describe a usable rig.
     """
     document = read_yaml(path)
     names = camera_names(document)
@@ -73,7 +73,7 @@ def load(path: Path) -> Rig:
 
 
 def camera_names(document: Section) -> list[str]:
-    """List the cameras ``cam0``, ``cam1`` ... of a chain by number."""
+    """List the names of a chain's cameras, ``cam0``, ``cam1`` ..., in the order of their numbers."""
     names = [key for key in document.values if re.fullmatch(r"cam\d+", str(key))]
     return sorted(names, key=lambda name: int(name[3:]))
 
@@ -102,12 +102,12 @@ def cameras_of(document: Section) -> list[Camera]:
 
 
 def line_time_us_of(section: Section) -> float:
-    """Read a rolling shutter's ``line_delay`` (seconds) of Kalibr's and EuRoC's files; 0 where it is missing."""
+    """Read the line time of a rolling shutter, microseconds, from ``line_delay`` (seconds); 0 where it is missing."""
     return 1e6 * section.number(LINE_DELAY_KEY, 0.0)
 
 
 def imu_of(path: Path) -> Imu:
-    """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``; it has no time offset.
+    """Read the IMU from Kalibr's ``imu.yaml``, flat or under ``imu0``; the file has no time offset.
 
     Raises:
         RigError: if a noise value is missing, or body is not the IMU's frame.
@@ -123,10 +123,11 @@ def imu_of(path: Path) -> Imu:
 
 
 def _imu_matrices(section: Section) -> dict[str, Any]:
-    """Read scale and misalignment of Kalibr's model ``scale-misalignment``, or in OpenVINS's terms.
+    """Read scale and misalignment from the keys of Kalibr's model ``scale-misalignment`` or of OpenVINS.
 
-    Both have a reading as ``M R value + bias`` with ``R`` from the IMU's frame to the sensor's, and graphvio the value
-    as a matrix times the reading. What the accelerations do to a gyro (``A``, ``Tg``) is left out.
+    Both model a reading as ``M R value + bias``, where ``R`` rotates from the IMU's frame to the sensor's; graphvio
+    multiplies the reading by the inverse of ``M R``. The effect of accelerations on the gyro (``A``, ``Tg``) is left
+    out.
     """
     if section.values.get("gyroscopes") is not None:
         gyro, accel = section.section("gyroscopes"), section.section("accelerometers")
@@ -150,7 +151,7 @@ def _imu_matrices(section: Section) -> dict[str, Any]:
 
 
 def time_shifts_of(document: Section) -> dict[str, float | None]:
-    """Read ``timeshift_cam_imu`` of all cameras by name, seconds; None where it is missing."""
+    """Read ``timeshift_cam_imu`` of all cameras, seconds, by the camera's name; None where it is missing."""
     sections = {name: document.section(name) for name in camera_names(document)}
     is_given = {name: section.values.get(_TIME_SHIFT_KEY) is not None for name, section in sections.items()}
     return {name: each.number(_TIME_SHIFT_KEY) if is_given[name] else None for name, each in sections.items()}
@@ -168,7 +169,7 @@ def find_imu_file(camchain: Path) -> Path:
         file = camchain.parent / name
         if name != stem and file.is_file() and not camera_names(read_yaml(file)):
             return file
-    named_so = sorted(camchain.parent.glob("*imu*.y*ml"))  # as chains and their copies may be
+    named_so = sorted(camchain.parent.glob("*imu*.y*ml"))  # camera chains and their copies may match, too
     others = [file for file in named_so if file != camchain and not camera_names(read_yaml(file))]
     if len(others) == 1:
         return others[0]
@@ -181,7 +182,7 @@ def find_imu_file(camchain: Path) -> Path:
 
 
 class Lens(NamedTuple):
-    """A lens as `graphvio.rig.Camera` takes it."""
+    """Lens model, intrinsics and distortion as `graphvio.rig.Camera` takes them."""
 
     model: str  # graphvio's name
     intrinsics: Float  # (4,), pixels
@@ -189,7 +190,7 @@ class Lens(NamedTuple):
 
 
 class WrittenLens(NamedTuple):
-    """A lens in Kalibr's terms."""
+    """Lens models and values as Kalibr's files have them."""
 
     camera_model: str
     intrinsics: list[float]
@@ -201,8 +202,8 @@ def lens_of(section: Section, coefficients_key: str) -> Lens:
     """Read a camera's lens.
 
     Args:
-        section: of the camera.
-        coefficients_key: of the distortion coefficients.
+        section: the camera's section.
+        coefficients_key: key of the distortion coefficients.
 
     Raises:
         RigError: if its model is missing or not supported, or a value is missing.
@@ -232,7 +233,7 @@ def lens_of(section: Section, coefficients_key: str) -> Lens:
 
 
 def written_lens(camera: Camera) -> WrittenLens:
-    """Return a camera's lens as `lens_of` reads it; zeros at the end of the coefficients are left out."""
+    """Return a camera's lens as `lens_of` reads it; coefficients after the fourth are left out if all are zero."""
     names, values = COEFFICIENTS[camera.model], camera.distortion.tolist()
     pinhole = camera.intrinsics.tolist()
     if camera.model not in SPHERES.values():
@@ -246,7 +247,7 @@ def written_lens(camera: Camera) -> WrittenLens:
 
 
 def _n_sphere(model: str) -> int:
-    """Return how many coefficients of a model with a sphere are among Kalibr's intrinsics."""
+    """Return how many coefficients of a sphere model come first in Kalibr's ``intrinsics``."""
     return len([name for name in COEFFICIENTS[model] if name in ("xi", "alpha", "beta")])
 
 

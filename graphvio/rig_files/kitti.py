@@ -1,4 +1,4 @@
-"""KITTI calibration: ``calib.txt`` (P0 to P3) of the odometry benchmark and ``calib_cam_to_cam.txt`` of raw drives.
+"""Reader of KITTI's ``calib.txt`` (P0 to P3) of the odometry benchmark and ``calib_cam_to_cam.txt`` of raw drives.
 
 Both describe rectified images, ``P_i = K_i [1 | t_i]`` with ``X_cam_i = X_cam0 + t_i``. Body is the rectified
 grey left camera, which is also the frame of the benchmark's poses. The grey pair (0, 1) is used, or the colour pair
@@ -23,7 +23,7 @@ _PAIRS = (("grey", 0, 1), ("colour", 2, 3))
 
 
 def load_odometry(file: Path) -> Rig:
-    """Read ``calib.txt``; the image size, which it lacks, is that of the images next to it.
+    """Read ``calib.txt``; the image size, which it lacks, is read from the images next to it.
 
     Raises:
         RigError: if a projection or the images are missing, or they do not describe a usable rig.
@@ -50,8 +50,8 @@ def load_raw(file: Path, drive: Path | None = None) -> Rig:
     """Read ``calib_cam_to_cam.txt`` for a synchronised, rectified drive.
 
     Args:
-        file: the calibration.
-        drive: folder with ``image_00`` ..., from which the pair is chosen; None takes the grey pair.
+        file: ``calib_cam_to_cam.txt``.
+        drive: folder with ``image_00`` ...; the pair whose images it holds is chosen. None for the grey pair.
 
     Raises:
         RigError: if a projection or size is missing, or they do not describe a usable rig.
@@ -69,7 +69,7 @@ def load_raw(file: Path, drive: Path | None = None) -> Rig:
 
 
 def pair_of(folders: list[str], pattern: str) -> tuple[str, int, int]:
-    """Choose the pair ``(name, left, right)``: the first whose two image folders exist, or the grey one."""
+    """Choose the pair ``(name, left, right)``: the first whose two image folders exist, or else the grey pair."""
     for pair in _PAIRS:
         if pattern.format(pair[1]) in folders and pattern.format(pair[2]) in folders:
             return pair
@@ -77,7 +77,7 @@ def pair_of(folders: list[str], pattern: str) -> tuple[str, int, int]:
 
 
 def raw_calibration_of(drive: Path) -> Path | None:
-    """Find ``calib_cam_to_cam.txt`` in a drive's folder or the folder of its day; None if neither has it."""
+    """Find ``calib_cam_to_cam.txt`` in a drive's folder or in the folder of its date; None if neither holds it."""
     drive = drive.resolve()
     for folder in (drive, drive.parent):
         if (folder / RAW_FILE).is_file():

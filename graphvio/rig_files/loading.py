@@ -14,7 +14,7 @@ _FORMATS = (
     "(mav0), KITTI's calib.txt or calib_cam_to_cam.txt, a configuration of OpenVINS, VINS-Fusion or ORB-SLAM3"
 )
 _OPENVINS_CHAIN_KEY = "relative_config_imucam"
-"""Of the camera chain, in OpenVINS's ``estimator_config.yaml``."""
+"""Key of the camera chain's file name in OpenVINS's ``estimator_config.yaml``."""
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -67,7 +67,7 @@ def _load(path: Path) -> Rig:
     if orb_slam3.is_settings(document):
         return orb_slam3.load(document)
     if path.name == native.FILE_NAME:
-        return native.load(path)  # which says what is missing
+        return native.load(path)  # raises an error that names the missing key
     raise RigError(
         f"{path}: holds no calibration that graphvio knows; give one of: {_FORMATS}; a rig.yaml begins with  "
         f"{native.VERSION_KEY}: {native.VERSIONS[-1]}"
@@ -78,7 +78,7 @@ def find_rig(folder: Path) -> Rig | None:
     """Read the rig in the folder of a recording; None if there is none.
 
     Raises:
-        RigError: if there is one that is not usable.
+        RigError: if there is a calibration that is not usable, or there are several camera chains.
     """
     sensors = euroc.sensors_folder(folder)
     places = [folder] if sensors is None else [folder, sensors]

@@ -1,7 +1,7 @@
-"""graphvio's own ``rig.yaml``: any number of pairs and single cameras, and at most one IMU.
+"""Reader and writer of graphvio's own ``rig.yaml``: any number of pairs and single cameras, and at most one IMU.
 
-Version 2 has ``single_cameras``, and ``line_time_us`` and ``stamp_offset_s`` of cameras, version 1 has not. A rig
-without them is written in version 1.
+Version 2 of the format adds ``single_cameras``, and the keys ``line_time_us`` and ``stamp_offset_s`` of cameras. A rig
+that needs none of these is written in version 1.
 
 The format is documented with a full example in ``docs/reference/data-contract.md``.
 """
@@ -39,7 +39,7 @@ def load(path: Path) -> Rig:
     """Read a ``rig.yaml``.
 
     Raises:
-        RigError: if it cannot be read, lacks a value, or has an unknown key or an invalid value.
+        RigError: if the file cannot be read, lacks a value, or has an unknown key or an invalid value.
     """
     return parse(read_text(path), path)
 
@@ -48,11 +48,11 @@ def parse(text: str, path: Path) -> Rig:
     """Read a rig from the text of a ``rig.yaml``.
 
     Args:
-        text: of the ``rig.yaml``.
-        path: of the file, or of another one in which it is embedded.
+        text: contents of the ``rig.yaml``.
+        path: path of the file, or of another file in which the text is embedded; masks are relative to its folder.
 
     Raises:
-        RigError: if it lacks a value, or has an unknown key or an invalid value.
+        RigError: if the text lacks a value, or has an unknown key or an invalid value.
     """
     document = parse_yaml(text, path)
     version = document.values.get(VERSION_KEY)
@@ -81,11 +81,11 @@ def parse(text: str, path: Path) -> Rig:
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
-    """Write a ``rig.yaml`` that reads back to the last digit.
+    """Write a ``rig.yaml`` from which the same values are read back, to the last digit.
 
     Args:
-        rig: to be written.
-        path: of the file, which is replaced; masks are named relative to its folder.
+        rig: the rig to be written.
+        path: path of the file, which is replaced; paths of masks in its folder are written relative to it.
 
     Raises:
         RigError: if the file cannot be written.
@@ -96,9 +96,9 @@ def save_rig(rig: Rig, path: str | Path) -> None:
 
 
 def to_text(rig: Rig, folder: Path) -> str:
-    """Format a rig as ``rig.yaml`` for a folder; paths of masks inside the folder are relative to it."""
+    """Return the text of a ``rig.yaml`` in a folder; paths of masks inside the folder are relative to it."""
     lines = [
-        "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
+        "# Cameras of a rig, and its IMU. Metres, radians, seconds, pixels; body is the frame of the IMU.",
         f"{VERSION_KEY}: {VERSIONS[1] if rig.singles or _keys_of_version_2(rig) else VERSIONS[0]}",
         f"name: {_quoted(rig.name)}",
     ]
@@ -136,12 +136,12 @@ def to_text(rig: Rig, folder: Path) -> str:
 
 
 def _keys_of_version_2(rig: Rig) -> list[str]:
-    """Return the keys of version 2 that are needed for the rig's cameras."""
+    """Return the keys of version 2 that any of the rig's cameras needs."""
     return [key for key in _CAMERA_KEYS_OF_VERSION_2 if any(getattr(camera, key) for camera in rig.cameras)]
 
 
 def _sigmas(document: Section) -> CalibrationSigmas:
-    """Read the standard deviations of the calibration: a level's name, or values by name."""
+    """Read the standard deviations of the calibration, given as the name of a level or as a mapping of values."""
     if "calibration_sigmas" not in document.values:
         return FACTORY
     given = document.values["calibration_sigmas"]

@@ -1,7 +1,7 @@
-"""ORB-SLAM3's settings of version 1.0: one or two cameras, and the IMU.
+"""Reader of ORB-SLAM3's settings of version 1.0: one or two cameras, and the IMU.
 
-``Stereo.T_c1_c2`` maps points from the second camera's frame to the first one's, and ``IMU.T_b_c1`` from that to the
-IMU's frame, which is body; without an IMU body is the first camera. Noise is in densities.
+``Stereo.T_c1_c2`` maps points from the second camera's frame to the first camera's, and ``IMU.T_b_c1`` from the first
+camera's frame to the IMU's, which is body; without an IMU body is the first camera. Noise values are densities.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LENSES = {
     "KannalaBrandt8": ("equidistant", ("k1", "k2", "k3", "k4")),
     _RECTIFIED: ("radial-tangential", ()),
 }
-"""``Camera.type`` -> graphvio's name, and the keys of its coefficients."""
+"""``Camera.type`` -> graphvio's name of the lens model, and the keys of its coefficients."""
 _NOISE = dict(zip(NOISE_KEYS, ("NoiseGyro", "GyroWalk", "NoiseAcc", "AccWalk"), strict=True))
 
 
@@ -56,7 +56,7 @@ def _camera(document: Section, number: int, body_T_cam: Float) -> Camera:
         raise RigError(f"{document.where(_TYPE_KEY)}: unknown type {camera_type!r}; use one of {', '.join(_LENSES)}")
     model, coefficients = _LENSES[camera_type]
     prefix = "Camera1" if camera_type == _RECTIFIED else f"Camera{number}"
-    is_fisheye = model == "equidistant"  # whose coefficients have to be there
+    is_fisheye = model == "equidistant"  # its coefficients are required; those of other models are 0 if missing
     return Camera(
         name=f"cam{number - 1}",
         model=model,

@@ -1,4 +1,4 @@
-"""YAML of calibration files as sections that include file and key in their errors."""
+"""Readers of calibration files: YAML mappings as sections, whose errors name the file and the key."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _DEFAULTS = {f.name: f.default for f in fields(Imu)}
 
 @dataclass(frozen=True)
 class Section:
-    """A mapping in a YAML file."""
+    """A mapping in a YAML or JSON file."""
 
-    values: Mapping[str, Any]  # of the mapping
-    file: Path  # that contains it
-    key: str = ""  # of the mapping in the file, empty at the top level
+    values: Mapping[str, Any]  # the mapping
+    file: Path  # the file that contains it
+    key: str = ""  # full key of the mapping in the file, empty at the top level
 
     def where(self, key: str) -> str:
-        """Format file and full key for messages."""
+        """Return the file and the full key, for messages."""
         return f"{self.file}: {self.key}.{key}" if self.key else f"{self.file}: {key}"
 
     def only(self, known: Iterable[str]) -> None:
-        """Raise for keys that are not in ``known``; the error names a similar one that is, or all."""
+        """Raise an error if a key is not in ``known``; its message has a similar key that is, or all of them."""
         known = list(known)
         for key in self.values:
             if key not in known:
@@ -54,7 +54,7 @@ class Section:
         return self.nested(self.get(key), key)
 
     def nested(self, value: object, key: str) -> Section:
-        """Convert a value of this mapping to a section; ``key`` is its name in messages."""
+        """Convert a value of this mapping to a section; ``key`` is the value's key, for messages."""
         if not isinstance(value, dict):
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be a mapping of keys to values")
         return Section(value, self.file, f"{self.key}.{key}" if self.key else key)
@@ -69,14 +69,14 @@ class Section:
         return str(value)
 
     def model(self, key: str, known: Iterable[str]) -> str:
-        """Get a required name of a camera or distortion model that is one of those known."""
+        """Get a required name of a camera or distortion model; it must be in ``known``."""
         name = self.text(key)
         if name not in known:
             raise RigError(f"{self.where(key)}: unknown model {name!r}; use one of {', '.join(known)}")
         return name
 
     def flag(self, key: str) -> bool:
-        """Get true or false; false if it is not given."""
+        """Get a value that is true or false; false if it is not given."""
         value = self.values.get(key, False)
         if not isinstance(value, bool):
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be true or false")
@@ -89,9 +89,9 @@ class Section:
         return float(self.array(key, ()))
 
     def array(self, key: str, shape: tuple[int, ...] | None = None) -> Float:
-        """Get a required array of finite numbers; ``shape`` None takes any one-dimensional array."""
+        """Get a required array of finite numbers; with ``shape`` None, of one dimension and any length."""
         value = self.get(key)
-        if isinstance(value, bool):  # which numpy takes for 1 or 0
+        if isinstance(value, bool):  # numpy would convert it to 1 or 0
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must hold numbers only")
         try:
             array = np.array(value, dtype=np.float64)  # converts '1e-5', which YAML 1.1 reads as a string
@@ -121,17 +121,21 @@ class Section:
         return self.array(key, (4, 4))
 
     def rotation(self, quat_wxyz: Float, key: str) -> Float:
-        """Convert a quaternion (4,) of this mapping to a rotation (3, 3); ``key`` is its name in messages."""
+        """Convert a quaternion (4,) of this mapping to a rotation (3, 3); ``key`` is the quaternion's, for messages."""
         norm = float(np.linalg.norm(quat_wxyz))
         if abs(norm - 1.0) > _MAX_NORM_ERROR:
             raise RigError(f"{self.where(key)}: the quaternion's norm is {norm:.4g}; it must be 1")
         return rotation_from_quat_wxyz(quat_wxyz / norm)
 
     def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, Any]:
-        """Get rate and noise densities of an IMU, whose keys are given by the names of `graphvio.rig.Imu`.
+        """Get the rate and the noise densities of an IMU by the names that `graphvio.rig.Imu` has for them.
+
+        Args:
+            rate_key: key of the rate in the file.
+            keys: name in `graphvio.rig.Imu` -> key in the file, of each density.
 
         Raises:
-            RigError: if one is missing; the message has graphvio's defaults, ready to be pasted.
+            RigError: if a value is missing; the message has graphvio's defaults, ready to be pasted.
         """
         names = {"rate_hz": rate_key, **keys}
         missing = [name for name, key in names.items() if self.values.get(key) is None]
@@ -146,7 +150,7 @@ class Section:
 
 
 class _UniqueKeys(yaml.SafeLoader):
-    """Refuses a key that a mapping has twice, of which YAML would silently take the last."""
+    """YAML loader that raises an error if a mapping has a key twice; PyYAML would silently use the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -158,7 +162,7 @@ class _UniqueKeys(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> Section:
-    """Read a YAML file, also as Kalibr and OpenCV write it; an empty file is an empty mapping.
+    """Read a YAML file, also in the dialects of Kalibr and OpenCV; an empty file gives an empty mapping.
 
     Raises:
         RigError: if the file cannot be read or is no mapping.
@@ -198,7 +202,7 @@ def read_text(path: Path) -> str:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Prefix errors of rig objects with the file's path."""
+    """Prefix a `RigError` that is raised in the context with the file's path."""
     try:
         yield
     except RigError as error:

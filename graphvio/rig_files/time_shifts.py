@@ -1,8 +1,8 @@
-"""Cameras whose stamps differ from the IMU's by times of their own, as Kalibr's ``timeshift_cam_imu`` says.
+"""Time shifts between the IMU and each camera, as Kalibr's ``timeshift_cam_imu`` gives them.
 
-Where all cameras are triggered together these times are one, but for errors of its calibration. Devices that run
-independently have one each: the IMU's time offset is then that of the rig's first camera, and the others' stamps are
-corrected to its clock.
+Cameras that are triggered together have the same time shift, apart from calibration errors. Devices that run
+independently have one each: the IMU's time offset is then the shift of the rig's first pair or camera, and the stamps
+of the others are corrected to the clock of that one.
 """
 
 from __future__ import annotations
@@ -17,24 +17,26 @@ from graphvio.errors import RigError
 from graphvio.rig import CameraGroup, Rig
 
 MAX_DIFFERENCE_S = 5e-3
-"""Of the time shifts of cameras that are triggered together."""
+"""Largest difference between the time shifts of cameras that are triggered together."""
 STAMP_DECIMALS = 9
-"""Of seconds: stamps are in nanoseconds."""
+"""Decimals of a stamp offset in seconds, since stamps are in nanoseconds."""
 
 
 def with_time_shifts(rig: Rig, given_s: Mapping[str, float | None], path: Path) -> Rig:
     """Return a rig with the time shifts of its cameras, ``t_imu = stamp + shift``.
 
-    Shifts that agree within 5 ms are taken for one, their mean. Otherwise each pair has the mean of its two cameras.
+    If all shifts agree within 5 ms, their mean is the IMU's time offset. Otherwise each pair gets the mean of its two
+    cameras, and each single camera its own.
 
     Args:
-        rig: without time offsets.
-        given_s: of the cameras in the file, by name; None where there is none, which is 0 if all agree.
-        path: of the file, for messages.
+        rig: the rig, without time offsets.
+        given_s: time shifts of the cameras in the file, seconds, by the camera's name; None where a shift is missing,
+            which counts as 0.
+        path: path of the file, for messages.
 
     Raises:
-        RigError: if those of a pair's left and right camera differ by more than 5 ms, or one is missing and others are
-            not near 0.
+        RigError: if the shifts do not agree within 5 ms, and one is missing, or those of a pair's left and right camera
+            differ by more than 5 ms.
     """
     shifts_s = {name: 0.0 if shift is None else shift for name, shift in given_s.items()}
     shifts = list(shifts_s.values())

@@ -1,9 +1,9 @@
-"""VINS-Fusion's configuration: where its cameras are in the IMU's frame, and the file of each camera's lens.
+"""Reader of VINS-Fusion's configuration: extrinsics of the cameras, the IMU, and the name of a lens file per camera.
 
-``body_T_cam0`` is graphvio's ``body_T_cam``, and ``td`` its ``time_offset_s``. Lenses are in camodocal's terms.
-VINS-Fusion integrates the IMU sample by sample: ``gyr_n`` and the others are standard deviations of one sample, and
-there is no rate in the file. They become densities at graphvio's default rate, and at least its default densities,
-since many files have densities in their place.
+``body_T_cam0`` is graphvio's ``body_T_cam``, and ``td`` its ``time_offset_s``. Lens files have camodocal's models.
+VINS-Fusion integrates the IMU sample by sample: ``gyr_n`` and the other noise values are standard deviations of one
+sample, and the file has no rate. They are converted to densities at graphvio's default rate, and are at least
+graphvio's default densities, since many files give densities instead of standard deviations of a sample.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LENSES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "KANNALA_BRANDT": ("equidistant", ("mu", "mv", "u0", "v0"), ("k2", "k3", "k4", "k5")),
     "MEI": ("omnidirectional", ("gamma1", "gamma2", "u0", "v0"), ("xi", *_BROWN)),
 }
-"""``model_type`` -> graphvio's name, keys of its intrinsics, and those of its coefficients."""
+"""``model_type`` -> graphvio's name of the lens model, keys of the intrinsics, and keys of the coefficients."""
 
 
 def is_config(document: Section) -> bool:
@@ -35,10 +35,10 @@ def is_config(document: Section) -> bool:
 
 
 def load(document: Section) -> Rig:
-    """Read a rig of one or two cameras from a configuration and the files of lenses that it names.
+    """Read a rig of one or two cameras from a configuration and the lens files that it names.
 
     Raises:
-        RigError: if a file cannot be read or lacks a value, or they do not describe a usable rig.
+        RigError: if a file cannot be read or lacks a value, or the files do not describe a usable rig.
     """
     path = document.file
     n_cameras = int(document.number("num_of_cam", 1.0))

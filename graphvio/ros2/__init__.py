@@ -1,1 +1,1 @@
-"""ROS 2 topics over DDS, without a ROS installation."""
+"""ROS 2 topics and services over DDS, without a ROS installation."""

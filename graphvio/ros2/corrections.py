@@ -1,4 +1,4 @@
-"""Corrections from ROS 2 messages: poses of keyframes in the map."""
+"""Corrections received as ROS 2 messages: poses of keyframes in the map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphvio.slam.checks import check_covariance, check_pose
 from graphvio.slam.interface import Served
 from graphvio.slam.keyframe import Keyframe
 
-_TOLERANCE_NS: Final = 500_000  # more than the error of stamps that were seconds as floating-point numbers
+_TOLERANCE_NS: Final = 500_000  # more than the error of a stamp that was converted to floating-point seconds
 _MAX_KEYFRAMES: Final = 20_000
 _MAX_NORM_ERROR: Final = 1e-3
 
@@ -27,19 +27,19 @@ _MAX_NORM_ERROR: Final = 1e-3
 class Outcomes:
     """Outcomes of the corrections so far."""
 
-    accepted: int = 0  # number of accepted ones
-    refused: int = 0  # number of refused ones
-    is_refused: bool = False  # whether the newest one was
-    newest: str = "none received"  # outcome of the newest one, one line for people
+    accepted: int = 0  # number of accepted corrections
+    refused: int = 0  # number of refused corrections
+    is_refused: bool = False  # whether the newest correction was refused
+    newest: str = "none received"  # outcome of the newest correction, a line of text
 
 
 class Corrections:
-    """Passes corrections to the odometry; keyframes may be added in another thread."""
+    """Checks corrections and passes them to the odometry; keyframes may be added in another thread."""
 
     def __init__(self, served: Served, frames: Frames) -> None:
         self._served, self._frames = served, frames
         self._lock = threading.Lock()
-        self._stamps: deque[tuple[int, int]] = deque(maxlen=_MAX_KEYFRAMES)  # with the keyframe's id
+        self._stamps: deque[tuple[int, int]] = deque(maxlen=_MAX_KEYFRAMES)  # stamp and id of each keyframe
         self.outcomes = Outcomes()
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
@@ -48,7 +48,7 @@ class Corrections:
             self._stamps.append((keyframe.stamp_ns, keyframe.id))
 
     def take(self, data: bytes) -> None:
-        """Apply a ``geometry_msgs/PoseWithCovarianceStamped`` (CDR) and update ``outcomes``."""
+        """Apply a correction, a ``geometry_msgs/PoseWithCovarianceStamped`` in CDR, and update ``outcomes``."""
         try:
             accepted = self._apply(data)
             self.outcomes = Outcomes(self.outcomes.accepted + 1, self.outcomes.refused, False, accepted)
@@ -89,4 +89,4 @@ class Corrections:
 
 
 class _RefusedError(GraphvioError):
-    """A correction that is refused, by these checks or by the odometry."""
+    """Raised for a correction that is refused, by the checks of this module or by the odometry."""

@@ -1,4 +1,4 @@
-"""Frames of a robot by REP 103, 105 and 145: ``base_link``, the IMU's and the cameras' optical ones."""
+"""Frames of a robot by REP 103, 105 and 145: ``base_link``, the IMU's frame and the cameras' optical frames."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ IMU_LINK: Final = "imu_link"
 _OPTICAL: Final = "_optical_frame"
 _IMAGE_TOPICS: Final = ("/compressed", "/image_raw", "/image_rect", "/image")
 _CAM_R_BASE: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Of a camera that looks ahead: its z is ``base_link``'s x."""
+"""Rotation for a camera that looks ahead: its z axis is the x axis of ``base_link``."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Names of the frames, and where the rig's body is."""
+    """Names of a robot's frames, and the pose of the rig's body in its base."""
 
     base_T_body: Float  # (4, 4) pose of body, which is the IMU's frame, in ``base``
     base: str = BODY  # name of the robot's frame: x forward, y left, z up
@@ -31,26 +31,26 @@ class Frames:
 
     @staticmethod
     def of_rig(rig: Rig, base: str = BODY, imu: str = IMU_LINK) -> Frames:
-        """Return frames with ``base`` at body, its axes parallel to the IMU's.
+        """Return frames with the origin of ``base`` at body, and its axes parallel to the IMU's.
 
-        Of the 24 ways in which axes can be exchanged, that is taken by which the first pair's left camera looks ahead
-        most nearly and has the sky above.
+        Of the 24 rotations that map axes to axes, the one is taken by which the left camera of the first pair, or the
+        first single camera, is most nearly upright and looking ahead.
         """
-        wanted = _CAM_R_BASE.T @ rig.pairs[0].left.body_T_cam[:3, :3].T  # base_R_cam @ cam_R_body
+        wanted = _CAM_R_BASE.T @ rig.groups[0].left.body_T_cam[:3, :3].T  # base_R_cam @ cam_R_body
         return Frames(se3(max(_axis_rotations(), key=lambda R: float(np.sum(R * wanted))), np.zeros(3)), base, imu)
 
     def static_transforms(self, stamp_ns: int, rig: Rig) -> list[Any]:
-        """Return ``geometry_msgs/TransformStamped`` from base to the IMU, and from there to each camera."""
+        """Return the ``geometry_msgs/TransformStamped`` of the IMU in base, and of each camera in the IMU's frame."""
         return [
             transform(stamp_ns, self.base, self.imu, self.base_T_body),
             *(transform(stamp_ns, self.imu, optical_frame(each.name), each.body_T_cam) for each in rig.cameras),
         ]
 
     def in_base(self, estimate: Estimate) -> Estimate:
-        """Return an estimate with a pose as one of ``base`` instead of body.
+        """Return an estimate, which must have a pose and a covariance, with those of ``base`` instead of body.
 
-        Its velocity is that of base's origin, by the angular rate that ROS's messages have; what that rate's error
-        adds to the covariance is neglected.
+        The velocity is that of base's origin; it is computed with the angular rate of ROS's messages, and the
+        covariance does not include the error of that rate.
         """
         assert estimate.nav_T_body is not None
         assert estimate.covariance is not None
@@ -70,16 +70,16 @@ class Frames:
         )
 
     def correction_of(self, message: Any) -> tuple[Float, Float]:
-        """Return ``map_T_body`` and its covariance in body from a message with the pose of base and its covariance."""
+        """Return ``map_T_body`` (4, 4) and its covariance (6, 6) in body, from a message with those of base."""
         body_T_base = se3_inverse(self.base_T_body)
         turned = se3_adjoint(body_T_base)
         return pose_of(message) @ self.base_T_body, turned @ covariance_of(message) @ turned.T
 
 
 def optical_frame(camera: str) -> str:
-    """Return the frame of a camera, x right, y down and z forward, by its name or its topic's.
+    """Return the name of a camera's optical frame (x right, y down, z forward) from its name or that of its topic.
 
-    tf2 refuses names that begin with a slash.
+    It never begins with a slash, since tf2 refuses such names.
     """
     name = camera.strip("/")
     for suffix in _IMAGE_TOPICS:
@@ -88,7 +88,7 @@ def optical_frame(camera: str) -> str:
 
 
 def _axis_rotations() -> list[Float]:
-    """Return the 24 rotations that exchange axes."""
+    """Return the 24 rotations (3, 3) that map axes to axes."""
     signed = (
         np.eye(3)[list(order)] * np.array(signs)[:, None]
         for order in permutations(range(3))

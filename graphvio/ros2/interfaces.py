@@ -1,4 +1,4 @@
-"""ROS 2 types: messages, the services of parameters, and the messages by which nodes are known."""
+"""ROS 2 types: messages, the parameter services, and the discovery message by which nodes are announced."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graphvio.sessions import cdr
 
 DISCOVERY: Final = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 DISCOVERY_TOPIC: Final = "ros_discovery_info"
-"""In DDS, without a prefix."""
+"""Name of the topic in DDS, which has no prefix."""
 
 _LONG_GIDS: Final = ("foxy", "galactic", "humble")
 _SERVICES: Final = {
@@ -44,9 +44,10 @@ def response_type(service: str) -> str:
 
 @cache
 def types() -> Any:
-    """Return rosbags' types, of the distribution in ``ROS_DISTRO`` as far as distributions differ.
+    """Return the type store of rosbags for the distribution in ``ROS_DISTRO``.
 
-    Messages of sensors are the same in all. Identifiers of endpoints (Gid) have 24 bytes until Humble, and 16 after it.
+    Sensor messages are the same in all distributions; identifiers of endpoints (Gid) have 24 bytes until Humble, and 16
+    after it.
     """
     is_long = os.environ.get("ROS_DISTRO", "") in _LONG_GIDS
     store = cdr.typestore("ROS2_HUMBLE" if is_long else "ROS2_JAZZY")
@@ -57,7 +58,7 @@ def types() -> Any:
 
 
 def make(type_name: str, **fields: Any) -> Any:
-    """Create a message, or a request or response."""
+    """Create a message, a request or a response of a type from its fields."""
     return types().types[type_name](**fields)
 
 
@@ -67,9 +68,13 @@ def encode(message: Any) -> bytes:
 
 
 def entities(participant: bytes, name: str, readers: Sequence[bytes], writers: Sequence[bytes]) -> Any:
-    """Make the message that a participant has one node, such as ``/robot/graphvio``, with these readers and writers.
+    """Make the discovery message of a participant with one node.
 
-    All but the node are given by their identifiers of 16 bytes.
+    Args:
+        participant: identifier of the participant, 16 bytes.
+        name: name of the node, such as ``/robot/graphvio``.
+        readers: identifiers of the node's readers, 16 bytes each.
+        writers: identifiers of the node's writers, 16 bytes each.
     """
     namespace, _, base = name.rpartition("/")
     node = make(

@@ -15,10 +15,10 @@ from graphvio.slam.keyframe import Keyframe
 PATH, POINTS = "nav_msgs/msg/Path", "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS, CORRECTION = "diagnostic_msgs/msg/DiagnosticArray", "geometry_msgs/msg/PoseWithCovarianceStamped"
 MAP = "map"
-"""REP 105's name of the frame of global corrections."""
+"""Name that REP 105 has for the frame of global corrections."""
 
 _POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("track_id", "<u4"), ("pair", "<u4")])
-_DATATYPES: Final = {"<f4": 7, "<u4": 6}  # of sensor_msgs/PointField
+_DATATYPES: Final = {"<f4": 7, "<u4": 6}  # numpy's type -> constant of sensor_msgs/PointField
 
 
 class Level(IntEnum):
@@ -31,7 +31,11 @@ class Level(IntEnum):
 
 
 class ThinnedPath:
-    """Poses of the whole path: when they become too many, every second one is removed, and of later ones, too."""
+    """Poses of the whole path; when they become too many, every second one is removed, also of those added later.
+
+    Args:
+        max_poses: number of poses at which they are thinned.
+    """
 
     def __init__(self, max_poses: int) -> None:
         self._max_poses = max_poses
@@ -50,18 +54,18 @@ class ThinnedPath:
             self._stride *= 2
 
     def clear(self) -> None:
-        """Remove all poses, as those of another epoch follow."""
+        """Remove all poses, at the beginning of another epoch."""
         self._poses, self._newest, self._stride, self._count = [], None, 1, 0
 
     def poses(self) -> list[Any]:
-        """Return the poses that are kept, and the newest."""
+        """Return the poses that are kept, and the newest pose."""
         if not self._poses or self._poses[-1] is self._newest:
             return list(self._poses)
         return [*self._poses, self._newest]
 
 
 def landmarks(keyframe: Keyframe, imu: str) -> Any:
-    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks, with their identities, in the frame ``imu``."""
+    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks, with track and pair, in the frame named ``imu``."""
     marks = keyframe.landmarks
     points = np.zeros(len(marks), dtype=_POINT)
     for k, axis in enumerate("xyz"):
@@ -86,7 +90,7 @@ def landmarks(keyframe: Keyframe, imu: str) -> Any:
 
 
 def diagnosis(name: str, level: Level, message: str, hardware: str, values: Mapping[str, object]) -> Any:
-    """Make a ``diagnostic_msgs/DiagnosticStatus``, without the values that are None."""
+    """Make a ``diagnostic_msgs/DiagnosticStatus``; values that are None are left out."""
     pairs = [
         make("diagnostic_msgs/msg/KeyValue", key=key, value=f"{value:.6g}" if isinstance(value, float) else str(value))
         for key, value in values.items()

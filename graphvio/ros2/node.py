@@ -35,20 +35,20 @@ def domain_of(text: str | None) -> int:
 class Publication:
     """A topic that another participant publishes."""
 
-    topic: str  # such as ``/imu``
-    type_name: str  # such as ``sensor_msgs/msg/Imu``
+    topic: str  # name of the topic, such as ``/imu``
+    type_name: str  # type of its messages, such as ``sensor_msgs/msg/Imu``
 
 
 class Reader:
-    """Reads samples of one topic, in one thread.
+    """Reads the samples of one topic, in one thread.
 
     Args:
-        node: whose it is.
-        topic: such as ``/imu``.
-        type_name: such as ``sensor_msgs/msg/Imu``.
+        node: node that the reader belongs to.
+        topic: name of the topic, such as ``/imu``.
+        type_name: type of its messages, such as ``sensor_msgs/msg/Imu``.
         profile: quality of service.
-        prefix: of topics in DDS, ``rq`` for the requests of a service.
-        user_data: of a service.
+        prefix: prefix of the topic's name in DDS, such as ``rq`` for the requests of a service.
+        user_data: user data of the endpoint in DDS, such as a service's identity; empty for topics.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Reader:
         return [(each.data, each.sample_info.publication_handle) for each in taken if each.sample_info.valid_data]
 
     def user_data_of(self, writer: int) -> dict[str, str]:
-        """Return what a writer has in its user data by name, and nothing if it has gone."""
+        """Return the entries of a writer's user data by name; empty if the writer is gone."""
         return _user_data(self._reader.get_matched_publication_data(writer))
 
     @property
@@ -93,7 +93,11 @@ class Reader:
 
 
 class Writer:
-    """Publishes messages of one topic, with arguments as of a `Reader`; from any thread, and never waits."""
+    """Publishes messages of one topic, from any thread and without waiting; see `Reader` for the arguments.
+
+    Attributes:
+        refused: number of messages that were dropped.
+    """
 
     def __init__(
         self, node: Node, topic: str, type_name: str, profile: Profile, prefix: str = "rt", user_data: str = ""
@@ -131,17 +135,18 @@ class Writer:
         return len(self._writer.get_matched_subscriptions())
 
     def user_data_of_readers(self) -> list[dict[str, str]]:
-        """Return what the matching readers have in their user data, by name."""
+        """Return the entries of the user data of each matching reader, by name."""
         readers = self._writer.get_matched_subscriptions()
         return [_user_data(self._writer.get_matched_subscription_data(each)) for each in readers]
 
 
 class Node:
-    """A participant of a domain, and one of ROS's nodes once it is announced.
+    """A participant of a DDS domain, which becomes a ROS 2 node when it is announced.
 
     Attributes:
+        domain: number of the domain.
         reader_gids: identifiers of its readers, 16 bytes each.
-        writer_gids: identifiers of its writers.
+        writer_gids: identifiers of its writers, 16 bytes each.
 
     Raises:
         SourceError: if no network can be used.
@@ -171,7 +176,7 @@ class Node:
         self._stop: Any = GuardCondition(self.participant)
 
     def topic(self, dds_name: str, type_name: str) -> Any:
-        """Return the topic of DDS, one object for all its endpoints."""
+        """Return the DDS topic with a name and a type; all its endpoints share one object."""
         from cyclonedds.topic import Topic
 
         with self._lock:
@@ -187,13 +192,13 @@ class Node:
         return ".".join(f"{each:x}" for each in identity)
 
     def announce(self, name: str) -> None:
-        """Publish that the readers and writers so far are those of a node, such as ``/graphvio``."""
+        """Announce a node, such as ``/graphvio``, with the readers and writers that have been made so far."""
         readers, writers = list(self.reader_gids), list(self.writer_gids)
         self._discovery = Writer(self, interfaces.DISCOVERY_TOPIC, interfaces.DISCOVERY, TF_STATIC, prefix="")
         self._discovery.write(interfaces.entities(self.participant.guid.bytes, name, readers, writers))
 
     def waiter(self, readers: Sequence[Reader]) -> Callable[[float], None]:
-        """Return a function that waits until a reader has samples, the node is stopped, or so many seconds are over."""
+        """Return a function that waits until a reader has samples, the node is stopped, or a timeout (s) is over."""
         waitset = self._waitset_class(self.participant)
         for condition in (*(reader.ready for reader in readers), self._stop):
             waitset.attach(condition)
@@ -204,7 +209,7 @@ class Node:
         return wait
 
     def publications(self) -> list[Publication]:
-        """Return the known publications of others; discovery takes about a second after the node is made."""
+        """Return the publications that have been discovered in the domain; a new node needs about a second for it."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
         found = []
@@ -215,12 +220,12 @@ class Node:
         return found
 
     def stop(self) -> None:
-        """Wake all waiters, now and from now on; from any thread."""
+        """End the waits of all functions of `waiter`, now and later; may be called from any thread."""
         if self._stop is not None:
             self._stop.set(True)
 
     def leave(self) -> None:
-        """Release the domain; it is left when readers and writers are released, too."""
+        """Release the participant; it leaves the domain as soon as its readers and writers are released, too."""
         with self._lock:
             self._topics.clear()
             self._discovery = None
@@ -228,7 +233,7 @@ class Node:
 
 
 def _user_data(endpoint: Any) -> dict[str, str]:
-    """Parse the user data of an endpoint, such as ``typehash=...;clientid=...;``."""
+    """Parse the user data of an endpoint, such as ``typehash=...;clientid=...;``; empty if there is none."""
     from cyclonedds.qos import Policy
 
     if endpoint is None or Policy.Userdata not in endpoint.qos:

@@ -1,4 +1,4 @@
-"""A node's parameters, which can be read, and the answers of its parameter services."""
+"""A node's read-only parameters, and the responses of its parameter services."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SERVICES: Final = {
     "set_parameters": "SetParameters",
     "set_parameters_atomically": "SetParametersAtomically",
 }
-"""Name of each service below the node's, and its type."""
+"""Name of each parameter service below the node's name -> its type in ``rcl_interfaces/srv``."""
 
 _SEPARATOR: Final = "."
 
 
 class _Kind(IntEnum):
-    """Types of values, as in ``rcl_interfaces/ParameterType``."""
+    """Types of parameters, with the numbers of ``rcl_interfaces/ParameterType``."""
 
     NOT_SET = 0
     BOOL = 1
@@ -37,7 +37,7 @@ class _Kind(IntEnum):
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Value]:
-    """Return nested values by names with dots, as ROS 2 has them, without those that are None."""
+    """Flatten nested values to parameters of ROS 2, whose names have dots; values that are None are left out."""
     flat: dict[str, Value] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -48,13 +48,13 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Value]:
 
 
 class Parameters:
-    """Answers requests about parameters by name; none can be set."""
+    """Answers the requests of parameter services; requests to set a parameter are refused."""
 
     def __init__(self, values: Mapping[str, Value]) -> None:
         self._values = dict(sorted(values.items()))
 
     def answer(self, service: str, request: Any) -> Any:
-        """Return the response to a request of a service, by its type such as ``ListParameters``."""
+        """Return the response to a request; ``service`` is its type, such as ``ListParameters``."""
         values = self._values
         match service:
             case "ListParameters":
@@ -72,7 +72,7 @@ class Parameters:
         return make(response_type(service), **fields)
 
     def _list(self, prefixes: Sequence[str], depth: int) -> Any:
-        """Names that are a prefix, or below one by no more than ``depth`` levels, where 0 is any number."""
+        """List the names that equal a prefix, or are at most ``depth`` levels below one; 0 is any number of levels."""
         names = []
         for name in self._values:
             below = [name[len(each) + 1 :] for each in prefixes if name.startswith(each + _SEPARATOR)]

@@ -1,4 +1,4 @@
-"""A running odometry on ROS 2: poses, transforms, landmarks and diagnostics out, corrections in."""
+"""Publisher of a running odometry on ROS 2: sends poses, transforms, landmarks, diagnostics; receives corrections."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from graphvio.slam.interface import Served, map_of_epoch
 NODE: Final = "/graphvio"
 """Name of the node."""
 
-_STATIC: Final = "static"  # the static transforms, among the writers by type
+_STATIC: Final = "static"  # key of the writer of static transforms; the other writers have their type as key
 _DEPTH: Final = 200  # estimates that may be queued: ten seconds
 _POLL_S: Final = 0.1
-_PERIOD_S: Final = 1.0  # of diagnostics and the path
+_PERIOD_S: Final = 1.0  # period of diagnostics and of the path
 _STALE_S: Final = 2.0
 _PATH_POSES: Final = 1000
 _JOIN_S: Final = 5.0
@@ -52,14 +52,14 @@ _LEVELS: Final = {
 
 
 class Publisher:
-    """Publishes a running odometry until one of both is closed; the odometry never waits for it.
+    """Publishes a running odometry until `close`, without ever making it wait; a context manager.
 
     Args:
         served: the odometry.
-        domain: of DDS, or None for that of ``ROS_DOMAIN_ID``.
-        namespace: name of the node, which is the prefix of its own topics and services.
-        frames: of the robot; None for `Frames.of_rig`.
-        parameters: what the node's parameter services report, by names with dots.
+        domain: number of the DDS domain, or None for that of ``ROS_DOMAIN_ID``.
+        namespace: name of the node, and prefix of its own topics and services.
+        frames: frames of the robot; None for those of `Frames.of_rig`.
+        parameters: parameters that the node's parameter services report, by names with dots.
 
     Raises:
         SourceError: if the domain cannot be joined.
@@ -98,7 +98,7 @@ class Publisher:
         self._newest: Estimate | None = None
         self._newest_s = time.monotonic()
         self._trouble = ""
-        self._failure: tuple[str, Exception] | None = None  # of a thread, with its name
+        self._failure: tuple[str, Exception] | None = None  # name of a thread that failed, and its error
         self._closing = threading.Event()
         self._attempt(self._publish_frames)
         node.announce(namespace)
@@ -118,10 +118,10 @@ class Publisher:
             thread.start()
 
     def check(self) -> None:
-        """Check that all threads run.
+        """Check that no thread has failed.
 
         Raises:
-            ServiceError: if one has failed.
+            ServiceError: if a thread has failed.
         """
         if self._failure is not None:
             name, error = self._failure
@@ -238,7 +238,7 @@ class Publisher:
                     return
                 continue
             next_id = keyframe.id + 1
-            self._corrections.add_keyframe(keyframe)  # first, as a correction may follow the landmarks at once
+            self._corrections.add_keyframe(keyframe)  # before the landmarks: a correction may follow them at once
             if self._writers[POINTS].readers:
                 self._attempt(lambda: self._writers[POINTS].write(messages.landmarks(keyframe, self._frames.imu)))  # noqa: B023
 
@@ -256,7 +256,7 @@ class Publisher:
                 self._attempt(service.take)
 
     def _attempt(self, action: Callable[[], Any]) -> None:
-        """Run an action; if it fails, the diagnostics say so, and the thread goes on."""
+        """Run an action; an error is reported in the diagnostics, and the thread continues."""
         try:
             action()
         except GraphvioError as error:

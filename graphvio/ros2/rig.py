@@ -1,4 +1,4 @@
-"""The rig of a running ROS 2 system, by its ``camera_info`` and ``tf_static`` topics."""
+"""The rig of a running ROS 2 system, from its ``camera_info`` and ``tf_static`` topics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _POLL_S = 0.05
 
 
 class _FirstMessages:
-    """First messages of topics, as a `graphvio.sessions.topics.MessageReader`."""
+    """Received messages by topic, with the interface of `graphvio.sessions.topics.MessageReader`."""
 
     def __init__(self, domain: int) -> None:
         self.path = Path(f"DDS domain {domain}")
@@ -43,10 +43,17 @@ def listen_for_rig(
     imu: str | None,
     wait: Callable[[float], bool],
 ) -> tuple[Rig, dict[str, str]]:
-    """Receive the rig of the stereo pairs that are published, and the topic with the images for each of its cameras.
+    """Make a rig of the stereo pairs whose images and ``camera_info`` are published.
 
-    Only the cameras given as name -> topic are used, or all if none is; ``wait`` sleeps for so many seconds, and
-    returns False when the time is over.
+    Args:
+        node: participant of the domain.
+        published: publications in the domain.
+        cameras: name -> image topic of the cameras to be used; empty for all.
+        imu: topic of the IMU, or None.
+        wait: sleeps for a number of seconds, and returns False when the time for receiving is over.
+
+    Returns:
+        The rig, and name -> image topic of its cameras.
 
     Raises:
         RigError: if the messages received within the time do not make a rig.
@@ -79,14 +86,17 @@ def listen_for_rig(
 def listen_for_transforms(
     node: Node, published: list[Publication], wait: Callable[[float], bool]
 ) -> dict[tuple[str, str], Float]:
-    """Receive all static transforms; see `graphvio.sessions.rig_of_topics.transforms_of`."""
+    """Receive all static transforms, in the form of `graphvio.sessions.rig_of_topics.transforms_of`.
+
+    See `listen_for_rig` for the arguments.
+    """
     return transforms_of(_receive(node, [], published, wait))
 
 
 def _receive(
     node: Node, readers: list[Reader], published: list[Publication], wait: Callable[[float], bool]
 ) -> _FirstMessages:
-    """Receive the first message of each reader, and static transforms from each of their publishers."""
+    """Receive the first message of each reader, and static transforms until there is one per publisher."""
     received = _FirstMessages(node.domain)
     expected = Counter(
         each.topic for each in published if each.type_name == TRANSFORMS and each.topic.endswith("tf_static")
@@ -104,7 +114,7 @@ def _receive(
 
 
 def _rename_cameras(rig: Rig, cameras: Mapping[str, str]) -> tuple[Rig, dict[str, str]]:
-    """Name cameras, which are named by their topics, as the user does; returns the rig and the topic of each camera."""
+    """Rename cameras, whose names are their topics, to the user's names; return the rig, and each camera's topic."""
     names = {topic: name for name, topic in cameras.items()}
     topics = {names.get(camera.name, camera.name): camera.name for camera in rig.cameras}
     unused = sorted(set(cameras.values()) - set(topics.values()))

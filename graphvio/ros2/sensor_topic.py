@@ -1,4 +1,4 @@
-"""Readings from the topic of a camera or of an IMU."""
+"""Sensor readings from the ROS 2 topic of a camera or of an IMU."""
 
 from __future__ import annotations
 
@@ -21,20 +21,27 @@ from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, imu_sample
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import path_between
 
-_IMAGES: Final = 10  # that are kept until they are taken: half a second
+_IMAGES: Final = 10  # images that are kept until they are taken: half a second
 _SAMPLES: Final = 500
 _MAX_LEVER_M: Final = 0.005
 
 
 class SensorTopic:
-    """The topic of a camera, by its name in the rig, or with None of the IMU: its readings, publishers and losses.
+    """The topic of a camera or of the IMU: its readings, publishers and losses.
+
+    Args:
+        node: participant of the domain.
+        name: name of the topic.
+        types: type of the messages of each topic.
+        camera: name of the camera in the rig, or None for the IMU.
+        is_reliable: whether lost messages are requested again.
 
     Attributes:
-        frame: of the newest sample of the IMU.
+        frame: frame of the newest sample of the IMU.
         health: state at the last call of `poll`.
 
     Raises:
-        SourceError: if its messages are of another type.
+        SourceError: if the messages of a camera's topic are no images, or those of the IMU's topic no IMU samples.
     """
 
     def __init__(self, node: Node, name: str, types: Mapping[str, str], camera: str | None, is_reliable: bool) -> None:
@@ -50,11 +57,11 @@ class SensorTopic:
         self._newest_ns: int | None = None
 
     def notice(self, kind: EventKind, detail: str) -> Notice:
-        """Return a notice on this topic."""
+        """Return a notice about this topic."""
         return Notice(kind, f"{self.name}: {detail}", host_ns())
 
     def poll(self) -> Notice | None:
-        """Update `health`; returns a notice if the topic has lost its last publisher, or has one again."""
+        """Update `health`; return a notice if the topic has lost its last publisher or has one again, else None."""
         was_connected, is_connected = self.health.connected, self.reader.writers > 0
         counts = {"lost": self.reader.lost, **self.counts}
         self.health = DeviceHealth(self.name, is_connected, self.type_name, counts)
@@ -101,16 +108,17 @@ class SensorTopic:
 
 
 class BodyRotation:
-    """Rotates IMU samples into body, by transforms as of `graphvio.sessions.rig_of_topics.transforms_in`."""
+    """Rotates IMU samples into body, with transforms in the form of `graphvio.sessions.rig_of_topics.transforms_in`."""
 
     def __init__(self, body: str, transforms: dict[tuple[str, str], Float]) -> None:
         self._body, self._transforms = body, transforms
         self._body_R_imu: dict[str, Float | None] = {}
 
     def apply(self, reading: ImuReading, topic: SensorTopic) -> Iterator[Reading]:
-        """Yield the reading in body, after a notice if a new frame has no transform or a lever arm.
+        """Yield the reading in body.
 
-        Readings of frames without a transform are left out and counted.
+        Before the first reading of a frame, a notice is yielded if the frame has no transform to body or is more than
+        5 mm away from it. Readings of frames without a transform are left out and counted.
         """
         frame = topic.frame
         if frame not in self._body_R_imu:

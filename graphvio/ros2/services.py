@@ -1,4 +1,4 @@
-"""ROS 2 services as `rmw_cyclonedds` has them: a topic of requests and one of responses, each with a header."""
+"""ROS 2 services as in `rmw_cyclonedds`: a topic for requests and one for responses, whose messages have a header."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from graphvio.ros2.wire import Profile
 from graphvio.sessions import cdr
 
 PARAMETERS: Final = Profile(depth=1000)
-"""Of parameter services."""
+"""Quality of service of the parameter services."""
 
 _ENCAPSULATION_BYTES: Final = 4
 _HEADER_BYTES: Final = 16
-"""After the encapsulation: the client's identity (uint64) and the number of the request (int64)."""
+"""Size of the header after the encapsulation: the client's identity (uint64) and the number of the request (int64)."""
 _MATCH_S: Final = 0.1
 _POLL_S: Final = 0.005
 
@@ -27,10 +27,10 @@ class Service:
     """A service of a node; requests are answered in the thread that calls `take`.
 
     Args:
-        node: whose it is.
-        name: such as ``/graphvio/list_parameters``.
-        service: name of the type in ``rcl_interfaces/srv``.
-        answer: makes the response (rosbags' type) of a request.
+        node: node that provides the service.
+        name: name of the service, such as ``/graphvio/list_parameters``.
+        service: name of its type in ``rcl_interfaces/srv``.
+        answer: returns the response to a request, both of rosbags' types.
     """
 
     def __init__(self, node: Node, name: str, service: str, answer: Callable[[Any], Any]) -> None:
@@ -54,7 +54,7 @@ class Service:
             self._writer.write_bytes(with_header(header, interfaces.encode(response)))
 
     def _wait_for_client(self, writer: int) -> None:
-        """Wait until the client's reader is matched, as a response before that is lost; they may not be so at once."""
+        """Wait until the client's reader is matched, at most 0.1 s; a response before that would be lost."""
         client = self.reader.user_data_of(writer).get("clientid")
         end_s = time.monotonic() + _MATCH_S
         while client is not None and time.monotonic() < end_s:
@@ -64,10 +64,10 @@ class Service:
 
 
 def split_header(data: bytes) -> tuple[tuple[int, int], bytes]:
-    """Split a request into its header, the client's identity and the request's number, and the CDR message.
+    """Split a request into its header (client's identity and number of the request) and the CDR message.
 
     Raises:
-        SessionError: if it is too short to have a header.
+        SessionError: if the request is too short to have a header.
     """
     end = _ENCAPSULATION_BYTES + _HEADER_BYTES
     if len(data) < end:
@@ -77,6 +77,6 @@ def split_header(data: bytes) -> tuple[tuple[int, int], bytes]:
 
 
 def with_header(header: tuple[int, int], message: bytes) -> bytes:
-    """Insert a header into a CDR message; its 16 bytes leave the alignment of the fields as it is."""
+    """Insert a header into a CDR message; its length of 16 bytes does not change the alignment of the fields."""
     packed = struct.pack("<Qq" if message[1] & 1 else ">Qq", *header)
     return message[:_ENCAPSULATION_BYTES] + packed + message[_ENCAPSULATION_BYTES:]

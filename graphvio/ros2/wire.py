@@ -1,4 +1,4 @@
-"""ROS 2 on the wire: names and types of topics in DDS, made from rosbags' definitions, and qualities of service."""
+"""ROS 2 in DDS: names of topics, types of topics made from rosbags' definitions, and qualities of service."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def dds_type_name(type_name: str) -> str:
 
 
 def ros_type_name(dds_name: str) -> str | None:
-    """Convert a type's name in DDS to ROS's, or to None if it is not one of ROS's types."""
+    """Convert a type's name in DDS to its name in ROS, or to None if it is no ROS type."""
     parts = dds_name.split("::")
     if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
         return None
@@ -32,12 +32,12 @@ def ros_type_name(dds_name: str) -> str | None:
 
 
 def dds_topic(topic: str, prefix: str = "rt") -> str:
-    """Convert a topic such as ``/imu`` to its name in DDS, ``rt/imu``; services have ``rq`` and ``rr``."""
+    """Convert a topic such as ``/imu`` to its name in DDS, ``rt/imu``; services have the prefixes ``rq`` and ``rr``."""
     return f"{prefix}/{topic.lstrip('/')}" if prefix else topic
 
 
 def ros_topic(dds_name: str) -> str | None:
-    """Convert a topic's name in DDS to ROS's, or to None if it is not one of ROS's topics."""
+    """Convert a topic's name in DDS to its name in ROS, or to None if it is no ROS topic."""
     return dds_name[2:] if dds_name.startswith("rt/") else None
 
 
@@ -50,9 +50,9 @@ class Profile:
     is_latched: bool = False  # whether late readers receive the kept samples, too (transient local)
 
     def dds(self, type_name: str, user_data: str = "") -> Any:
-        """Return the policies of an endpoint; a writer never waits for slow readers.
+        """Return the DDS policies of an endpoint; with them, a writer never waits for slow readers.
 
-        ROS 2 from Iron on expects the type's hash in the user data, after what services have in it; older versions
+        From Iron on ROS 2 expects the type's hash in the user data, after the entries of services; older versions
         ignore it.
         """
         from cyclonedds.qos import Policy, Qos
@@ -70,23 +70,23 @@ DEFAULT = Profile()
 SENSOR_DATA = Profile(depth=5, is_reliable=False)
 TF = Profile(depth=100)
 TF_STATIC = Profile(depth=1, is_latched=True)
-"""Of publishers; that of nodes is the same."""
+"""Quality of service of publishers of static transforms, and of the discovery message of nodes."""
 TF_STATIC_READER = Profile(depth=100, is_latched=True)
-"""Of subscribers: there may be several publishers."""
+"""Quality of service of subscribers to static transforms, of which there may be several publishers."""
 
 
 @cache
 def idl_struct(type_name: str) -> Any:
-    """Return a type as cyclonedds' class of messages, whose fields are Python lists and numbers."""
+    """Return cyclonedds' class for messages of a type, whose fields are Python lists and numbers."""
     return _make_type(type_name, ())
 
 
 @cache
 def wire_type(type_name: str) -> Any:
-    """Return the type of a topic whose samples stay CDR: ``wire_type(name)(data)`` is a sample with ``data``.
+    """Return a topic's type whose samples are not decoded: ``wire_type(name)(data)`` is a sample with the CDR ``data``.
 
-    cyclonedds decodes sequences element by element in Python, 20 ms for an image of 640x480; rosbags' decoder returns
-    views of the data, and encodes to the same bytes.
+    cyclonedds would decode sequences element by element in Python, which takes 20 ms for an image of 640x480; rosbags'
+    decoder returns views of the data, and its encoder gives the same bytes.
     """
     return _make_type(type_name, (_raw(),))
 
@@ -103,17 +103,17 @@ def _raw() -> Any:
             self.data = data
 
         def serialize(self, *_: Any, **__: Any) -> bytes:
-            """Return the bytes for the writer."""
+            """Return the CDR bytes for the writer."""
             return self.data
 
         @classmethod
         def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
-            """Wrap the bytes that the reader received."""
+            """Wrap the CDR bytes that the reader received."""
             return cls(data)
 
         @classmethod
         def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Any:
-            """Return None: ROS's topics have no keys."""
+            """Return None, since ROS's topics have no keys."""
             return None
 
     return Raw
@@ -135,7 +135,7 @@ def _make_type(type_name: str, bases: tuple[Any, ...]) -> Any:
 
 
 def _field(kind: Any) -> Any:
-    """Convert the type of a field from rosbags' to cyclonedds' description."""
+    """Convert the description of a field's type from rosbags to cyclonedds."""
     from cyclonedds.idl import types
 
     kinds = cdr.node_types()

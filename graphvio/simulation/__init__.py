@@ -1,6 +1,6 @@
-"""Image-level simulator: a rig of cameras and an IMU is carried through textured worlds.
+"""Simulator of images and IMU samples of a rig that is carried through textured worlds.
 
-`simulate` writes a recording; `make_simulator` yields the same images, IMU samples and truth in memory.
+`simulate` writes a recording; `make_simulator` provides the same images, IMU samples and truth in memory.
 """
 
 from graphvio.simulation.calibration_error import CalibrationErrorSizes

@@ -1,10 +1,10 @@
-"""Calibration errors as real ones are: what the files of a recording say about its sensors differs from the truth.
+"""Realistic calibration errors: differences between the calibration in a recording's files and the true one.
 
-Cameras keep their true calibration, with which images are rendered, and the files are wrong. The IMU's files say what
-they always say, and its data are wrong: by scale, misalignment, noise and a time offset.
+For cameras the files are wrong: images are rendered with the rig's calibration, and the files get one with errors. For
+the IMU the files are unchanged, and its data are wrong, by scale, misalignment, noise and a time offset.
 
-Each component is sampled from a random stream of its own. So a component by itself has the same error as among all
-others, and errors of another level have the same directions.
+Each component is sampled from a random stream of its own. So with the same seed, a component has the same error alone
+as together with others, and the errors of two levels have the same directions.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ from graphvio.errors import SourceError
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair
 
-_STREAM = 3  # of the seed: 1 is the IMU's noise, 2 that of images
+_STREAM = 3  # number of the random stream of a seed; 1 is the IMU's noise, 2 the noise of images
 
 
 @dataclass(frozen=True)
 class CalibrationErrorSizes:
-    """Sizes of calibration errors; standard deviations, unless something else is said. The default is no error.
+    """Sizes of calibration errors: standard deviations, unless noted otherwise. The default is no error.
 
     Attributes:
-        focal_percent: of a camera's focal length: fx and fy have one common factor.
-        principal_point_px: of cx and cy of each camera.
-        distortion_percent: of the first two coefficients of each camera, k1 and k2 of most, each in percent of itself.
+        focal_percent: focal length of each camera; fx and fy have one common factor.
+        principal_point_px: cx and cy of each camera.
+        distortion_percent: first two coefficients of each camera, k1 and k2 for most models, in percent of themselves.
         left_right_deg: rotation of the right camera about its own centre, for each axis.
         baseline_percent: length of the baseline.
         cameras_in_body_deg: rotation of all cameras together, about body's origin, for each axis.
         cameras_in_body_mm: translation of all cameras together, for each axis.
-        pair_transform_deg: rotation of each pair but the first, about its left camera, for each axis.
-        pair_transform_mm: translation of each pair but the first, for each axis.
+        pair_transform_deg: rotation of each pair but the first, about its left camera, and of each single camera, for
+            each axis.
+        pair_transform_mm: translation of each pair but the first, and of each single camera, for each axis.
         time_offset_ms: magnitude of the IMU's time offset; only its sign is random.
-        imu_scale_percent: of each axis of gyro and accelerometer.
+        imu_scale_percent: scale of each axis of gyro and accelerometer.
         imu_misalignment_deg: off-diagonal elements of the matrices of gyro and accelerometer, as angles.
-        imu_noise_factor: white noise over the stated one; not random.
+        imu_noise_factor: ratio of the actual white noise to that in the files; not random.
 
     Raises:
         SourceError: if a size is negative or not finite, or the noise would be zero.
@@ -69,8 +70,8 @@ class CalibrationErrorSizes:
         """Return the errors of one of `LEVELS`.
 
         Args:
-            level: one of them.
-            components: only these, some of `COMPONENTS`; None for all.
+            level: one of `LEVELS`.
+            components: names of `COMPONENTS`, to which the errors are limited; None for all.
 
         Raises:
             SourceError: if there is no such level or component.
@@ -103,13 +104,13 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
     "imu-misalignment": ("imu_misalignment_deg",),
     "imu-noise": ("imu_noise_factor",),
 }
-"""Component -> fields of `CalibrationErrorSizes`."""
+"""Name of a component -> its fields in `CalibrationErrorSizes`."""
 
 
 def _level(
     factor: float, time_offset_ms: float, scale_percent: float, misalignment_deg: float, noise: float
 ) -> CalibrationErrorSizes:
-    """Return the errors of a level: cameras have a multiple of those of level 2."""
+    """Return the errors of a level: camera errors are ``factor`` times those of level 2, IMU errors are as given."""
     return CalibrationErrorSizes(
         focal_percent=factor * 0.1,
         principal_point_px=factor * 0.5,
@@ -133,16 +134,16 @@ _LEVELS = {
     3: _level(3.0, 8.0, 1.0, 0.5, 2.2),
 }
 LEVELS = tuple(_LEVELS)
-"""Levels of `CalibrationErrorSizes.of_level`: a careful calibration, a usual one, and one of long ago."""
+"""Levels of `CalibrationErrorSizes.of_level`: a careful calibration, an ordinary one, and an old one."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImuError:
-    """Errors of an IMU's data that no rig file can express.
+    """Scale and misalignment of an IMU's data, which the files of a simulated recording do not contain.
 
     Attributes:
-        gyro_matrix: (3, 3), by which the true angular velocity is multiplied.
-        accel_matrix: (3, 3), by which the true specific force is multiplied.
+        gyro_matrix: (3, 3) matrix by which the true angular velocity is multiplied.
+        accel_matrix: (3, 3) matrix by which the true specific force is multiplied.
     """
 
     gyro_matrix: Float = field(default_factory=lambda: np.eye(3))
@@ -151,11 +152,11 @@ class ImuError:
 
 @dataclass(frozen=True, eq=False)
 class SampledError:
-    """A calibration error that was sampled.
+    """A sampled calibration error.
 
     Attributes:
-        written_rig: what the files say.
-        true_rig: with the true cameras, and the true noise and time offset of the IMU.
+        written_rig: the rig as the files describe it.
+        true_rig: the rig with the true cameras, and the true noise and time offset of the IMU.
         imu: other errors of the IMU's data.
     """
 
@@ -165,10 +166,10 @@ class SampledError:
 
 
 def draw(rig: Rig, error: CalibrationErrorSizes, seed: int) -> SampledError:
-    """Draw a calibration error.
+    """Sample a calibration error.
 
     Args:
-        rig: with the true cameras, and the IMU as its files describe it.
+        rig: the rig with the true cameras, and the IMU as its files describe it.
         error: sizes of the errors.
         seed: the same seed gives the same error.
 

@@ -1,7 +1,7 @@
 """Default rig of the simulator: the paper's four cameras, back to back in two stereo pairs.
 
-Frame body is the IMU's: x forward, y left, z up. T_12 and the roll, pitch and yaw of R_12 are the paper's (section 5),
-the angles about the usual vehicle axes forward, right, down.
+Frame body is the IMU's: x forward, y left, z up. T_12 and the roll, pitch and yaw of R_12 are the paper's (section 5);
+the angles are about the usual vehicle axes forward, right, down.
 """
 
 import numpy as np
@@ -35,7 +35,7 @@ _DISTORTION = np.array(
         [-0.090, 0.020, -0.00029, -0.00011, 0.0],
     ]
 )
-# Rotation vectors, degrees: no pair is mounted perfectly parallel.
+# Rotation vectors of the right cameras, degrees: the cameras of a real pair are not perfectly parallel.
 _RIGHT_MISALIGNMENT_DEG = np.array([[0.31, -0.42, 0.18], [-0.27, 0.36, -0.22]])
 
 
@@ -46,14 +46,14 @@ def rotation_zyx(yaw: float, pitch: float, roll: float) -> Float:
 
 
 def paper_left2_T_left1() -> Float:
-    """Return ``P_12`` of the paper's eq. (1) (4, 4): points of the front left camera into the back left camera."""
+    """Return ``P_12`` (4, 4) of the paper's eq. (1), from the front left camera to the back left camera."""
     roll, pitch, yaw = np.deg2rad(_ROLL_PITCH_YAW_12_DEG)
     rotation = _CAM_R_VEHICLE @ rotation_zyx(yaw, pitch, roll) @ _CAM_R_VEHICLE.T
     return se3(np.ascontiguousarray(rotation), _T_12)
 
 
 def default_rig() -> Rig:
-    """Return a rig of pairs ``front`` (cam0, cam1) and ``back`` (cam2, cam3): 78 degrees wide, baselines of 12 cm."""
+    """Return the rig of pairs ``front`` (cam0, cam1) and ``back`` (cam2, cam3), 78 degrees wide, baselines of 12 cm."""
     tilt = np.deg2rad(_FRONT_TILT_DEG)
     forward = np.array([np.cos(tilt), 0.0, -np.sin(tilt)])
     right = np.array([0.0, -1.0, 0.0])

@@ -1,4 +1,4 @@
-"""IMU of the simulator. A sample is the instantaneous value at its stamp, in frame body."""
+"""The simulated IMU; a sample is the instantaneous value at its stamp, in frame body."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ImuTrack:
 
     Attributes:
         stamps_ns: (N,), on the IMU's clock.
-        true_stamps_ns: (N,), of the same instants on the cameras' clock.
+        true_stamps_ns: (N,), the same instants on the cameras' clock.
         angular_velocity: (N, 3) rad/s, measured.
         linear_acceleration: (N, 3) m/s^2, measured specific force.
         gyro_bias: (N, 3) rad/s, true.
@@ -59,12 +59,12 @@ def measure(
     """Sample the IMU along a motion, with white noise and random-walk biases.
 
     Args:
-        motion: of the body.
+        motion: motion of the body.
         imu: rate, noise densities and time offset.
         times_s: (N,) seconds since the start of the motion.
         stamps_ns: (N,) stamps of these times on the cameras' clock.
-        seed: of the noise, the initial biases and their random walks.
-        error: scale and misalignment; None for none.
+        seed: seed of the noise, the initial biases and their random walks.
+        error: scale and misalignment errors, or None.
     """
     states = motion.at(times_s)
     rate, force = ideal_readings(states)

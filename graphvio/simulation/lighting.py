@@ -1,6 +1,6 @@
-"""Light on the surfaces: lamps with shadows, computed once for all static surfaces.
+"""Lighting of surfaces by lamps, with shadows; computed once for all static surfaces.
 
-The light on a rectangle is computed on a grid of points and interpolated between them.
+The light on a rectangle is computed at a grid of points and interpolated between them.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _EVEN_LIGHT = 0.62
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """Light on rectangles: values (L,) float32; grid (Q, 3) of offset into the values, columns (u) and rows (v)."""
+    """Light on Q rectangles: values (L,) float32, and grid (Q, 3) with the offset into them, columns (u), rows (v)."""
 
     values: np.ndarray[tuple[int], np.dtype[np.float32]]
     grid: Int
@@ -33,7 +33,7 @@ def light_map(rectangles: list[Rectangle], lamps: list[Lamp], ambient: float) ->
     end = 0
     for i, r in enumerate(rectangles):
         columns, rows = (1, 1) if r.lit_evenly or not lamps else (_cells(r.edge_u), _cells(r.edge_v))
-        # Not quite to the edge, where the point would lie inside the neighbouring wall.
+        # The grid ends just before the edge, where a point would lie inside the neighbouring wall.
         u, v = np.meshgrid(np.linspace(0.01, 0.99, columns), np.linspace(0.01, 0.99, rows))
         points.append(r.origin + u.reshape(-1, 1) * r.edge_u + v.reshape(-1, 1) * r.edge_v)
         normals.append(np.repeat(r.normal[None], rows * columns, axis=0))
@@ -55,19 +55,19 @@ def light_map(rectangles: list[Rectangle], lamps: list[Lamp], ambient: float) ->
 
 
 def light_without_shadow(points: Float, normals: Float, lamps: list[Lamp], ambient: float) -> Float:
-    """Compute the light (N,) at points (N, 3) with unit normals (N, 3), without shadows: for moving parts."""
+    """Compute the light (N,) at points (N, 3) of moving parts with unit normals (N, 3), without shadows."""
     return irradiance(points, normals, _lamp_array(lamps), np.zeros((0, 3, 3))) + ambient
 
 
 @kernel
 def irradiance(points: Float, normals: Float, lamps: Float, blockers: Float) -> Float:
-    """Compute the direct light of lamps with shadows.
+    """Compute the direct light of lamps, with shadows.
 
     Args:
         points: (N, 3), metres.
         normals: (N, 3) unit normals.
-        lamps: (M, 4) position and power.
-        blockers: (B, 3, 3) origin, edge_u, edge_v of rectangles that cast shadows.
+        lamps: (M, 4) position in metres, and power.
+        blockers: (B, 3, 3) origin, edge_u, edge_v of rectangles that cast shadows, metres.
 
     Returns:
         Light (N,), without the ambient part.

@@ -1,4 +1,4 @@
-"""Motion of the body: a spline that yields poses, rates and accelerations exactly, and walks along paths as such."""
+"""Motions of the body: a spline whose poses, rates and accelerations are exact, and walks along a path, built on it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from graphvio.arrays import Float
 
 KNOT_S = 0.05
 STEP_S = 0.01
-_CORNER_S = 1.5  # over which a corner of the path is rounded
-_HEADING_S = 2.2  # over which the body turns at a corner
+_CORNER_S = 1.5  # time over which a corner of the path is rounded
+_HEADING_S = 2.2  # time over which the body turns at a corner
 
-# Uniform quintic B-spline: weights of six control values as polynomials of the place u (0 to 1) between two
+# Uniform quintic B-spline: weights of six control values as polynomials of the position u (0 to 1) between two
 # knots; row i holds the coefficients of 1, u, ..., u^5 for control value i.
 _BASIS = (
     np.array(
@@ -52,10 +52,10 @@ class Motion:
     """A motion of the body, four times continuously differentiable.
 
     Args:
-        course: returns ``[x, y, z, yaw, pitch, roll]`` (N, 6) in metres and radians at times (N,) in seconds, the
-            control values of the spline, which follows them and rounds the sharpest bends. Rotation is
+        course: returns ``[x, y, z, yaw, pitch, roll]`` (N, 6) in metres and radians at times (N,) in seconds. These are
+            the control values of the spline, which follows them and rounds the sharpest bends. The rotation is
             ``Rz(yaw) Ry(pitch) Rx(roll)``.
-        duration_s: end; the motion is defined from 0 to there.
+        duration_s: end of the motion, which is defined from 0 to there.
     """
 
     def __init__(self, course: Callable[[Float], Float], duration_s: float) -> None:
@@ -97,7 +97,7 @@ def _weights_and_derivatives(u: Float) -> tuple[Float, Float, Float]:
 
 
 def _rotations(yaw: Float, pitch: Float, roll: Float) -> Float:
-    """``Rz Ry Rx`` (N, 3, 3)."""
+    """Return the rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` (N, 3, 3)."""
     cy, sy, cp = np.cos(yaw), np.sin(yaw), np.cos(pitch)
     sp, cr, sr = np.sin(pitch), np.cos(roll), np.sin(roll)
     rows = [
@@ -118,7 +118,7 @@ def _body_rates(pitch: Float, roll: Float, rates: Float) -> Float:
 
 @dataclass(frozen=True)
 class Gait:
-    """Periodic motion of the body by each step: amplitudes in metres and radians, steps per second."""
+    """Periodic motion of the body with the steps of a walk: steps per second, and amplitudes in metres and radians."""
 
     steps_hz: float = 1.9
     vertical_m: float = 0.024
@@ -130,15 +130,15 @@ class Gait:
 
 
 class Walk:
-    """A walk along the corners of a path, which stops at its end and stays there.
+    """A walk along a path, which stops at its end and stays there.
 
     Args:
-        path: (N, 3) corners, metres, at the height of the body.
-        speed_mps: m/s.
-        duration_s: of the motion.
-        stationary_s: initial standstill, after which about a second passes until the walk has its speed; with 0 it is
-            at full speed from the beginning.
-        gait: None for the default one.
+        path: (N, 3) corners of the path, metres, at the height of the body.
+        speed_mps: speed, m/s.
+        duration_s: duration of the motion.
+        stationary_s: initial standstill, after which it takes about a second to reach the speed; with 0 the walk is at
+            full speed from the beginning.
+        gait: periodic motion with the steps; None for the default one.
     """
 
     def __init__(
@@ -148,9 +148,9 @@ class Walk:
         self.gait = gait if gait is not None else Gait()
         lengths = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
         self._corner_at = np.concatenate([[0.0], np.cumsum(lengths)])
-        # Smoothing spreads the first step over half its window on each side: begin later, for a true standstill.
+        # Smoothing spreads the departure over half its window on each side: depart later, for a true standstill.
         start_s = stationary_s + 0.5 * max(_CORNER_S, _HEADING_S) if stationary_s > 0.0 else -2.0
-        # The whole path, even if a part is wanted: a shorter recording is the beginning of the whole one.
+        # Compute the whole path even if a part is wanted, so that a shorter motion is the beginning of the whole one.
         end_s = max(duration_s, start_s + self._corner_at[-1] / speed_mps)
         self._times = np.arange(-2.0, end_s + 3.0, STEP_S)
         walked = np.clip(speed_mps * (self._times - start_s), 0.0, None)
@@ -169,7 +169,7 @@ class Walk:
         position = np.column_stack([smoothed(along[:, i], _CORNER_S) for i in range(3)])
         yaw = smoothed(headings[leg], _HEADING_S)
         pace = smoothed(np.gradient(self._walked, STEP_S), _CORNER_S)
-        stride = pace / max(float(pace.max()), 1e-9)  # no bob at standstill
+        stride = pace / max(float(pace.max()), 1e-9)  # no periodic motion at standstill
         gait, t = self.gait, self._times
         step, side = 2.0 * np.pi * gait.steps_hz * t, np.pi * gait.steps_hz * t
         sway = stride * gait.lateral_m * np.sin(side)

@@ -30,7 +30,7 @@ def stereo_and_back() -> Rig:
 
 
 def headset() -> Rig:
-    """Return four fisheyes, 126 degrees wide and 158 diagonally: a pair in front, and a camera on each side."""
+    """Return four fisheye cameras, 126 degrees wide and 158 diagonally: a pair in front, and one on each side."""
     lens = ("equidistant", np.array([290.0, 290.0, 319.5, 239.5]), np.array([0.0034, 0.0007, -0.0020, 0.0002]))
     left, right, to_left, to_right = (
         Camera(f"cam{k}", lens[0], _SIZE_PX, *lens[1:], _body_T_cam(position_m, yaw_deg, pitch_deg))
@@ -48,7 +48,7 @@ def headset() -> Rig:
 
 
 def surround() -> Rig:
-    """Return six cameras on a circle, 90 degrees wide, none of which is a pair with another."""
+    """Return six single cameras on a circle, each 90 degrees wide."""
     lens = ("radial-tangential", np.array([320.0, 320.0, 319.5, 239.5]), np.array([-0.05, 0.01, 0.0, 0.0]))
     cameras = []
     for k in range(6):
@@ -60,7 +60,7 @@ def surround() -> Rig:
 
 
 def phone() -> Rig:
-    """Return one camera, 66 degrees wide, whose rolling shutter takes 20 ms."""
+    """Return a single camera, 66 degrees wide, with a rolling shutter of 20 ms."""
     lens = ("radial-tangential", np.array([495.0, 495.0, 321.3, 237.8]), np.array([0.08, -0.12, 3e-4, -2e-4]))
     line_time_us = 20e3 / _SIZE_PX[1]
     camera = Camera("cam0", lens[0], _SIZE_PX, *lens[1:], _body_T_cam((0.0, 0.02, 0.06), 0.0, 5.0), None, line_time_us)
@@ -68,7 +68,7 @@ def phone() -> Rig:
 
 
 def car() -> Rig:
-    """Return a stereo pair of 1241x376 pixels with a baseline of 0.537 m, as of KITTI's cars, in front of the body."""
+    """Return a stereo pair of 1241x376 pixels with a baseline of 0.537 m, as on KITTI's car, in front of the body."""
     intrinsics = np.array([718.856, 718.856, 607.1928, 185.2157])
     lens = ("radial-tangential", (1241, 376), intrinsics, np.zeros(4))
     cameras = (Camera(f"cam{k}", *lens, _body_T_cam((1.0, 0.27 - 0.537 * k, 0.0), 0.0, 0.0)) for k in range(2))
@@ -84,7 +84,7 @@ def drone() -> Rig:
 
 
 def _body_T_cam(position_m: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> Float:
-    """Return the pose of a camera that looks to the left of forward by a yaw, and down by a pitch."""
+    """Return the pose (4, 4) of a camera that is turned from forward by a yaw to the left and a pitch downwards."""
     yaw, pitch = np.deg2rad(yaw_deg), np.deg2rad(pitch_deg)
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
@@ -101,14 +101,14 @@ NAMED_RIGS: dict[str, Callable[[], Rig]] = {
     "car": car,
     "drone": drone,
 }
-"""Rigs by name; ``paper`` is that of most scenes."""
+"""Functions that return the rig of a name; most scenes have ``paper``."""
 
 
 def rig_of(name: str) -> Rig:
-    """Return a rig by its name, or from a rig file.
+    """Return the rig of a name in `NAMED_RIGS`, or that of a rig file.
 
     Raises:
-        SourceError: if there is neither.
+        SourceError: if there is no such rig and no such file.
         RigError: if the file describes no usable rig.
     """
     if name in NAMED_RIGS:

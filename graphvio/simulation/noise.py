@@ -1,4 +1,4 @@
-"""Seamless noise, of which textures are made."""
+"""Seamless noise for textures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ Map = NDArray[np.float32]
 
 
 def noise(rng: Rng, coarsest: int, octaves: int, gain: float = 0.6) -> Map:
-    """Sample seamless noise (SIDE, SIDE) of unit deviation; ``coarsest`` cells a side, each octave twice as fine."""
+    """Sample seamless noise (SIDE, SIDE) of unit standard deviation.
+
+    Args:
+        rng: random generator.
+        coarsest: cells along a side in the first octave; each octave is twice as fine as the one before.
+        octaves: number of octaves.
+        gain: amplitude of an octave relative to the one before.
+    """
     total = np.zeros((SIDE, SIDE), dtype=np.float32)
     amplitude, cells = 1.0, coarsest
     for _ in range(octaves):

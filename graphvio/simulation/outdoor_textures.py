@@ -1,4 +1,4 @@
-"""Reflectance maps of what is outdoors: facades, roofs, roads, plants, hills and sky."""
+"""Reflectance maps of outdoor surfaces: facades, roofs, roads, plants, hills and sky."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphvio.simulation.noise import SIDE, Map, Rng, noise
 
 
 def _of_noise(mean: float, deviation: float, coarsest: int, octaves: int, gain: float) -> Callable[[Rng], Map]:
-    """Return a painter of noise alone; see `noise`."""
+    """Return a painter of noise with a mean and a standard deviation; see `noise` for the other arguments."""
 
     def paint(rng: Rng) -> Map:
         return np.asarray(mean + deviation * noise(rng, coarsest, octaves, gain), dtype=np.float32)
@@ -67,4 +67,4 @@ OUTDOOR_PAINTERS: dict[str, tuple[Callable[[Rng], Map], float]] = {
     "hills": (_of_noise(0.4, 0.12, 4, 7, 0.75), 200.0),
     "sky": (_of_noise(0.8, 0.03, 4, 3, 0.5), 400.0),
 }
-"""Name -> painter, and metres that one repetition covers."""
+"""Name -> function that paints the texture, and metres that one repetition covers."""

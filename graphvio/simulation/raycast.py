@@ -1,8 +1,8 @@
 """Kernels of the renderer: the first rectangle on each ray, and its radiance.
 
-With the ray ``(x, y, 1)`` in frame cam, every rectangle is nine numbers: inverse depth is ``w = c . ray``,
-and its coordinates (0 to 1 inside) are ``u = a . ray / w`` and ``v = b . ray / w``. Everything that decides
-visibility is thus linear in (x, y), so whole image tiles can be tested against a rectangle at once.
+For rays ``(x, y, 1)`` in frame cam, a rectangle is described by three vectors c, a, b: the inverse depth on a ray is
+``w = c . ray``, and the rectangle's coordinates there (0 to 1 inside) are ``u = a . ray / w`` and ``v = b . ray / w``.
+All conditions of visibility are thus linear in (x, y), so a whole image tile can be tested against a rectangle at once.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ def ray_coefficients(corners: Float, cam_T_world: Float) -> Float:
 
     Args:
         corners: (Q, 3, 3) origin, edge_u, edge_v; metres, frame world.
-        cam_T_world: (4, 4).
+        cam_T_world: pose (4, 4) of the world in the camera's frame.
     """
     coefficients = np.zeros((len(corners), 9))
     rotation, translation = cam_T_world[:3, :3].copy(), cam_T_world[:3, 3].copy()
@@ -41,14 +41,14 @@ def ray_coefficients(corners: Float, cam_T_world: Float) -> Float:
 
 @kernel
 def _maximum(x: float, y: float, z: float, boxes: Float, n: int) -> float:
-    """Maximise a linear form over a box ``[x0, x1, y0, y1]`` of rays."""
+    """Return the maximum of ``(x, y, z) . ray`` over the rays in box n, ``[x0, x1, y0, y1]``."""
     maximum: float = max(x * boxes[n, 0], x * boxes[n, 1]) + max(y * boxes[n, 2], y * boxes[n, 3]) + z
     return maximum
 
 
 @kernel
 def _nearest_in(k: Float, i: int, boxes: Float, n: int) -> float:
-    """Bound rectangle i's inverse depth over box n of rays from above; -1 if it is visible nowhere in it."""
+    """Return an upper bound of rectangle i's inverse depth over the rays in box n; -1 if none of them meets it."""
     nearest = _maximum(k[i, 0], k[i, 1], k[i, 2], boxes, n)
     if nearest <= 0.0:
         return -1.0
@@ -65,11 +65,11 @@ def tile_lists(coefficients: Float, tile_boxes: Float) -> tuple[Int, Int, Float]
     """List the candidate rectangles of every tile, nearest first.
 
     Args:
-        coefficients: (Q, 9).
-        tile_boxes: (T, 4) ``[x0, x1, y0, y1]`` of the rays of each tile.
+        coefficients: (Q, 9) from `ray_coefficients`.
+        tile_boxes: (T, 4) extent ``[x0, x1, y0, y1]`` of the rays of each tile.
 
     Returns:
-        Offsets (T + 1,) of the tiles' lists, rectangles (N,), and upper bounds of their inverse depth (N,).
+        Offsets (T + 1,) of the tiles' lists, rectangles (N,), and upper bounds (N,) of their inverse depth.
     """
     everywhere = np.array(
         [[tile_boxes[:, 0].min(), tile_boxes[:, 1].max(), tile_boxes[:, 2].min(), tile_boxes[:, 3].max()]]
@@ -99,7 +99,7 @@ def tile_lists(coefficients: Float, tile_boxes: Float) -> tuple[Int, Int, Float]
 def _first_hit(
     coefficients: Float, items: Int, bounds: Float, first: int, last: int, x: float, y: float
 ) -> tuple[int, float]:
-    """Find the nearest rectangle on a ray, or -1, and its inverse depth."""
+    """Find the nearest rectangle on the ray (x, y), -1 for none, and its inverse depth."""
     best, nearest = -1, 0.0
     for n in range(first, last):
         if bounds[n] <= nearest:
@@ -120,10 +120,10 @@ def _first_hit(
 
 @kernel
 def first_hits(coefficients: Float, offsets: Int, items: Int, bounds: Float, rays: Float) -> tuple[Int, Float]:
-    """Find the first rectangle on the ray of every pixel's centre.
+    """Find the nearest rectangle on the ray of every pixel's centre.
 
     Args:
-        coefficients: (1, Q, 9), or (H, Q, 9) of each line, whose tiles are then one line high.
+        coefficients: (1, Q, 9), or (H, Q, 9) for the lines of a rolling shutter, with tiles that are one line high.
         offsets: (T + 1,) from `tile_lists`.
         items: (N,) from `tile_lists`.
         bounds: (N,) from `tile_lists`.
@@ -155,7 +155,7 @@ def first_hits(coefficients: Float, offsets: Int, items: Int, bounds: Float, ray
 
 @kernel
 def _bilinear(values: AnyArray, start: int, x: float, y: float, mask: int) -> float:
-    """Interpolate a grid stored row by row at (x, y); indices wrap around (the side is ``mask + 1``)."""
+    """Interpolate at (x, y) a square grid, stored row by row from ``start``; indices wrap around at ``mask + 1``."""
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = x - x0, y - y0
     left, top = int(x0) & mask, int(y0) & mask
@@ -253,12 +253,12 @@ def shade(
     """Compute the radiance (H, W) float32; pixels at the border of two rectangles are averages over a grid of rays.
 
     Args:
-        coefficients: (1, Q, 9), or (H, Q, 9) of each line, whose tiles are then one line high.
+        coefficients: (1, Q, 9), or (H, Q, 9) for the lines of a rolling shutter, with tiles that are one line high.
         offsets: (T + 1,) from `tile_lists`.
         items: (N,) from `tile_lists`.
         bounds: (N,) from `tile_lists`.
         rays: (H, W, 2) normalised coordinates of the pixels.
-        slopes: (H, W, 2, 2) their derivative with respect to the pixel's column and row.
+        slopes: (H, W, 2, 2) derivative of ``rays`` with respect to the pixel's column and row.
         hit: (H, W) from `first_hits`.
         texture: (Q,), see `Surfaces`.
         mapping: (Q, 4), see `Surfaces`.

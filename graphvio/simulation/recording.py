@@ -1,6 +1,6 @@
 """Writer of simulated recordings in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``.
 
-Where that is wrong by a calibration error, ``rig-true.yaml`` next to it is right.
+With a calibration error, ``rig.yaml`` has the wrong calibration, and ``rig-true.yaml`` next to it the true one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from graphvio.simulation.simulator import Simulator
 TRUE_RIG_FILE = "rig-true.yaml"
 
 Progress = Callable[[int, int], None]
-"""Called with (framesets written, framesets in all)."""
+"""Function that is called with the number of framesets written and their total number."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class SimulatedRecording:
 
     Attributes:
         path: folder that holds ``mav0`` and ``rig.yaml``.
-        scene: its name.
+        scene: name of the scene.
         framesets: number of instants at which cameras took an image.
         images: number of image files.
         imu_samples: number of IMU samples.
-        duration_s: length of the walk.
+        duration_s: duration of the motion.
         path_length_m: length of the body's true path, at the stamps of the IMU.
-        events: name -> (start, end), in seconds since the first frameset, of the scene's hard moments.
+        events: difficult moments of the scene: name -> (start, end), in seconds since the first frameset.
     """
 
     path: Path
@@ -76,19 +76,19 @@ def simulate(
     """Simulate a scene and write it as a recording.
 
     Args:
-        name: scene, one of `graphvio.simulation.SCENE_NAMES`.
+        name: name of the scene, one of `graphvio.simulation.SCENE_NAMES`.
         out: folder to write; it must be empty or not exist.
-        duration_s: of the recording; None for the whole walk.
-        seed: of all noise; the same seed gives the same bytes.
-        rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it;
+        duration_s: duration of the recording; None for the whole walk.
+        seed: seed of all noise; the same seed gives the same bytes.
+        rate_hz: framesets per second; or one rate for each pair and single camera, the last one also for all after it;
             None for the scene's own rate.
-        stationary_s: initial standstill; 0 begins at walking speed.
-        trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
-        calibration_error: of the files that describe the cameras, and of the IMU's data; images are the same. None for
-            exact files.
-        calibration_seed: by which the error is sampled; None for ``seed``.
-        rig_change: one of `graphvio.simulation.RIG_CHANGES`, of the true cameras during the walk, which the files know
-            nothing of; None if they stay as they are.
+        stationary_s: initial standstill; with 0 the recording begins at walking speed.
+        trigger_offset_ms: delay of the triggers of each pair or single camera after those of the one before it.
+        calibration_error: sizes of the errors of the camera files and of the IMU's data; the images do not depend on
+            it. None for exact files and data.
+        calibration_seed: seed with which the calibration error is sampled; None for ``seed``.
+        rig_change: change of the true cameras during the walk, one of `graphvio.simulation.RIG_CHANGES`; the files do
+            not contain it. None for no change.
         rig: true cameras and IMU; None for the scene's own rig.
         progress: called as the framesets are written.
 
@@ -122,13 +122,14 @@ def simulate(
 def write_recording(
     simulator: Simulator, out: Path, progress: Progress | None = None, written_rig: Rig | None = None
 ) -> SimulatedRecording:
-    """Write what a simulator gives, on all cores.
+    """Write the recording of a simulator, with all cores.
 
     Args:
-        simulator: of the recording.
+        simulator: the simulator.
         out: folder to write; it must be empty or not exist.
         progress: called as the framesets are written.
-        written_rig: what the files say about cameras and IMU, with the true rig in a file beside; None for the truth.
+        written_rig: cameras and IMU as the files describe them; the true rig is then written to ``rig-true.yaml``.
+            None for the true rig.
 
     Raises:
         SourceError: if the folder is not empty or an image cannot be written.
@@ -152,7 +153,7 @@ def write_recording(
             _write_image(mav0 / cameras[number].name / "data" / f"{stamps[index]}.png", image)
 
     workers = usable_cores()
-    write(0)  # compiles the kernels once, before threads would wait for each other
+    write(0)  # compiles the kernels once; threads would wait for each other
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(_in_order(pool, write, range(1, len(stamps)), 2 * workers), start=2):
             if progress is not None:
@@ -178,7 +179,7 @@ def _require_empty(out: Path) -> None:
 def _in_order(
     pool: ThreadPoolExecutor, work: Callable[[int], None], indices: Sequence[int], ahead: int
 ) -> Iterator[None]:
-    """Yield results in order, with a bounded number pending so that an error or an interrupt stops soon."""
+    """Yield each time the next index is done; at most ``ahead`` are pending, so that an interrupt takes effect soon."""
     remaining = iter(indices)
     pending: list[Future[None]] = [pool.submit(work, i) for i in islice(remaining, ahead)]
     try:

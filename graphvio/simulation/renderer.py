@@ -1,4 +1,4 @@
-"""Images of a camera: radiance and depth along its rays, and the grey values that its sensor makes of the radiance."""
+"""Rendering of camera images: radiance and depth along the rays, and the grey values that the sensor makes of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphvio.simulation.textures import Atlas
 from graphvio.simulation.world import Exposure
 
 _VIGNETTING = 0.32  # light lost in the corner of the image
-_SHOT_VARIANCE = 0.02  # grey levels squared for every grey level of light: 50 electrons each
+_SHOT_VARIANCE = 0.02  # grey levels squared per grey level of light: 50 electrons per grey level
 _READ_NOISE = 0.7  # grey levels at gain 1
 
 
@@ -28,8 +28,8 @@ class RenderedView:
 
     Attributes:
         radiance: (H, W) float32, 1 for a white surface in full light.
-        depth: (H, W) metres along the camera's z axis, at each pixel's centre; infinite where nothing is.
-        is_moving: (H, W) whether the surface there moves.
+        depth: (H, W) metres along the camera's z axis, at each pixel's centre; infinite where there is no surface.
+        is_moving: (H, W) whether the surface belongs to a moving part.
     """
 
     radiance: NDArray[np.float32]
@@ -43,7 +43,7 @@ class CameraRays:
     Pixels without a ray, such as those of a fisheye that are more than 80 degrees from its axis, stay black.
 
     Args:
-        camera: of the rig.
+        camera: a camera of the rig.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -58,7 +58,7 @@ class CameraRays:
         self.tile_boxes = _tile_boxes(self.rays, self.slopes, TILE_PX if camera.line_time_us == 0.0 else 1)
 
     def render(self, surfaces: Surfaces, atlas: Atlas, world_T_cam: Float) -> RenderedView:
-        """Render the surfaces as seen from ``world_T_cam`` (4, 4), or (H, 4, 4) at each line of a rolling shutter."""
+        """Render surfaces as seen from ``world_T_cam`` (4, 4), or (H, 4, 4) for the lines of a rolling shutter."""
         poses = world_T_cam.reshape(-1, 4, 4)
         coefficients = np.array([ray_coefficients(surfaces.corners, se3_inverse(pose)) for pose in poses])
         boxes = np.split(self.tile_boxes, len(poses))
@@ -82,7 +82,7 @@ class CameraRays:
 
 @kernel
 def _ray_slopes(model: int, intrinsics: Float, distortion: Float, rays: Float) -> Float:
-    """Differentiate rays (N, 2) with respect to the pixel's column and row: (N, 2, 2)."""
+    """Compute the derivative (N, 2, 2) of rays (N, 2) with respect to the pixel's column and row."""
     slopes = np.empty((len(rays), 2, 2))
     for i in range(len(rays)):
         _, _, a, b, c, d = distort(model, distortion, rays[i, 0], rays[i, 1])
@@ -95,7 +95,7 @@ def _ray_slopes(model: int, intrinsics: Float, distortion: Float, rays: Float) -
 
 
 def _tile_boxes(rays: Float, slopes: Float, tile_height: int) -> Float:
-    """Compute the extent (T, 4) ``[x0, x1, y0, y1]`` of the rays of each tile, with half a pixel around it."""
+    """Compute the extent (T, 4) ``[x0, x1, y0, y1]`` of each tile's rays, with a margin of half a pixel."""
     height, width = rays.shape[:2]
     margin = 0.51 * np.abs(slopes).sum(axis=3)
     tops, lefts = np.arange(0, height, tile_height), np.arange(0, width, TILE_PX)
@@ -108,7 +108,7 @@ class Film:
     """Sensor of a camera: exposure, vignetting, shot and read noise, 8 bit.
 
     Args:
-        rays: of its pixels.
+        rays: rays of the camera's pixels.
         sensitivity: grey value of full radiance, as a fraction of white.
     """
 

@@ -1,4 +1,4 @@
-"""Rides of vehicles: motions by speed and heading over time, with the leaning and swaying of the vehicle."""
+"""Rides of vehicles: motions given by speed and heading over time, with the leaning and swaying of the vehicle."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.simulation.motion import STEP_S, Motion, smoothed
 
-_SMOOTH_S = 2.0  # over which speed and rate of turn change
-_MARGIN_S = 3.0  # before and after the knots of speed and heading
-_TONES = (0.61, 0.87, 1.16, 1.43)  # of swaying, as fractions of its mean frequency
+_SMOOTH_S = 2.0  # time over which speed and heading are smoothed
+_MARGIN_S = 3.0  # time before and after the knots of speed and heading
+_TONES = (0.61, 0.87, 1.16, 1.43)  # frequencies of the swaying, as fractions of its mean frequency
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """How a vehicle moves apart from where it goes; it sways at full speed, and not at standstill.
+    """Motion of a vehicle in addition to its path; swaying and tilting are proportional to the speed.
 
     Attributes:
-        height_m: of the body over the ground.
-        lean: angle towards the acceleration, rad for each m/s^2; 1/g for what flies, negative on springs.
-        sway_m: amplitudes along x, y and z of the world, of each of four sines.
-        sway_hz: their mean frequency.
+        height_m: height of the body over the ground.
+        lean: angle by which it leans towards the acceleration, rad per m/s^2; 1/g for a drone, negative for a vehicle
+            on springs.
+        sway_m: amplitudes of the swaying along x, y and z of the world, of each of its four sines.
+        sway_hz: mean frequency of these sines.
         tilt_rad: amplitude of pitch and roll, of each of four sines.
-        tilt_hz: their mean frequency.
+        tilt_hz: mean frequency of these sines.
     """
 
     height_m: float
@@ -37,12 +38,12 @@ class Vehicle:
 
 
 class Ride:
-    """A ride from the world's origin by linearly interpolated knots, which are then smoothed.
+    """A ride from the world's origin, with speed and heading interpolated linearly between knots, then smoothed.
 
     Args:
-        speeds: knots (seconds since departure, m/s); the first is at 0 s, the last speed is 0 at the end.
+        speeds: knots (seconds since departure, m/s); the first is at 0 s, and the last has speed 0.
         headings: knots (seconds since departure, degrees to the left of x).
-        vehicle: that rides.
+        vehicle: the vehicle.
 
     Attributes:
         path: (N, 2) positions, metres, frame world, in steps of 10 ms.
@@ -77,8 +78,8 @@ class Ride:
         """Make the motion of the body.
 
         Args:
-            duration_s: of the motion.
-            stationary_s: initial standstill; 0 begins at full speed.
+            duration_s: duration of the motion.
+            stationary_s: initial standstill; with 0 the motion begins at full speed.
         """
         departs_s = stationary_s + 0.5 * _SMOOTH_S if stationary_s > 0.0 else -self._top_s
 

@@ -1,4 +1,4 @@
-"""Simulated recordings in memory: images, IMU samples and truth of a walk through a scene."""
+"""Simulated recordings in memory: images, IMU samples and truth of a motion through a scene."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from graphvio.simulation.world import Scene
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _SENSITIVITIES = (1.45, 1.50, 1.42, 1.47)  # no two cameras are equally bright
-_KEPT_STAGES = 4  # of a rig that changes: about as many as threads render at once
+_KEPT_STAGES = 4  # stages of a changing rig whose rays are cached: about as many as threads render at once
 
 
 class Simulator:
-    """A rig that is carried through a scene; everything is a function of its arguments, to the bit.
+    """A rig that is carried through a scene; equal arguments give equal output, bit for bit.
 
     Args:
         scene: world, motion and light.
-        rig: true cameras and IMU; None for the scene's own rig. A rig without an IMU is given the default IMU.
-        seed: of all noise and biases. World and walk do not depend on it.
+        rig: true cameras and IMU; None for the scene's own rig. For a rig without an IMU, the default IMU is simulated.
+        seed: seed of all noise and biases. World and motion do not depend on it.
         rate_hz: framesets per second; or one rate for each pair and single camera, the last one also for all after it;
             None for the scene's own rate.
         atlas: textures of the world; None for the standard textures.
-        trigger_offset_ms: delay of each pair's triggers after those of the pair before it; likewise of single cameras.
-        imu_error: scale and misalignment of the IMU; None for none.
-        rig_change: of the true cameras during the walk; None if they stay as they are.
+        trigger_offset_ms: delay of the triggers of each pair or single camera after those of the one before it.
+        imu_error: scale and misalignment errors of the IMU, or None.
+        rig_change: change of the true cameras during the motion; None for no change.
 
     Attributes:
-        rates_hz: of each pair and single camera, images per second.
+        rates_hz: images per second of each pair and single camera.
 
     Raises:
         SourceError: if a rate or the offset is impossible.
@@ -70,7 +70,7 @@ class Simulator:
         if seed < 0:
             raise SourceError(f"the seed {seed} is negative; give 0 or more")
         self.scene = scene
-        self.rig = NAMED_RIGS[scene.rig]() if rig is None else rig.without_stamp_offsets()  # stamps are instants
+        self.rig = NAMED_RIGS[scene.rig]() if rig is None else rig.without_stamp_offsets()  # its stamps are instants
         self.imu = self.rig.imu if self.rig.imu is not None else Imu()
         self.seed = seed
         groups = len(self.rig.groups)
@@ -82,7 +82,7 @@ class Simulator:
 
     @cached_property
     def _prepared(self) -> PreparedWorld:
-        """The world as the renderer's kernels read it; it takes a second, for which only who renders waits."""
+        """The world as the renderer's kernels read it; made at the first rendering, since it takes a second."""
         return PreparedWorld(self.scene.world, self._atlas if self._atlas is not None else standard_atlas())
 
     @cached_property
@@ -92,7 +92,7 @@ class Simulator:
 
     @cached_property
     def stamps_ns(self) -> Int:
-        """Stamps (N,) of the framesets: all instants at which any pair is triggered."""
+        """Stamps (N,) of the framesets: all instants at which a pair or single camera is triggered."""
         return np.unique(np.concatenate([self.triggers_ns(group) for group in range(len(self.rig.groups))]))
 
     def cameras_of(self, group: int) -> range:
@@ -101,7 +101,7 @@ class Simulator:
         return range(first, first + len(self.rig.groups[group].cameras))
 
     def triggers_ns(self, group: int) -> Int:
-        """Return the stamps (M,) at which a pair or single camera takes images, which end within the walk."""
+        """Return the stamps (M,) at which a pair or single camera takes images; readouts end within the motion."""
         readout_s = 1e-9 * max(camera.readout_ns for camera in self.rig.groups[group].cameras)
         rate, duration_s = self.rates_hz[group], self.scene.motion.duration_s - readout_s
         late_ns = round(group * self._trigger_offset_ms * 1e6)
@@ -138,13 +138,13 @@ class Simulator:
     def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> RenderedView:
         """Render the noise-free radiance and true depth of an image.
 
-        Each line of a rolling shutter is seen from where the camera is at that line's instant. What moves in the world
-        stands still meanwhile.
+        Each line of a rolling shutter is rendered from the camera's pose at that line's instant. Moving parts of the
+        world are the same for all lines.
 
         Args:
-            index: of the frameset.
+            index: index of the frameset.
             camera: index in ``rig.cameras``.
-            surfaces: of this instant, if they are there already.
+            surfaces: surfaces at the frameset's instant, if they have been computed already.
         """
         seen = surfaces if surfaces is not None else self.surfaces(index)
         rays = self._rays_in(self._rig_stage(index))[camera]
@@ -162,7 +162,7 @@ class Simulator:
         return self.films[camera].expose(self.view(index, camera, surfaces).radiance, exposure, noise)
 
     def frameset(self, index: int, noisy: bool = True) -> FrameSet:
-        """Render the images of the pairs that are triggered at one instant."""
+        """Render the images of the pairs and single cameras that are triggered at one instant."""
         surfaces = self.surfaces(index)
         images = {
             k: tuple(self.image(index, camera, noisy, surfaces) for camera in self.cameras_of(k))
@@ -206,10 +206,10 @@ def make_simulator(
 
     Args:
         name: one of `graphvio.simulation.SCENE_NAMES`.
-        duration_s: of the recording; None for the whole walk.
+        duration_s: duration of the recording; None for the whole walk.
         seed: see `Simulator`.
         rate_hz: see `Simulator`.
-        stationary_s: initial standstill; 0 begins at walking speed.
+        stationary_s: initial standstill; with 0 the recording begins at walking speed.
         trigger_offset_ms: see `Simulator`.
         rig: see `Simulator`.
         imu_error: see `Simulator`.

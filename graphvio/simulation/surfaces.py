@@ -1,4 +1,4 @@
-"""Arrays of a world at one instant, as the renderer's kernels read them."""
+"""The surfaces of a world at one instant, as arrays for the renderer's kernels."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Surfaces:
         texture: (Q,) index in the atlas.
         mapping: (Q, 4) texture repetitions along u, shift along u, and the same for v.
         tint: (Q,) factor of the reflectance.
-        light: on the rectangles.
-        is_moving: (Q,).
+        light: light on the rectangles.
+        is_moving: (Q,) whether the rectangle belongs to a moving part.
     """
 
     corners: Float
@@ -34,7 +34,7 @@ class Surfaces:
 
 
 class PreparedWorld:
-    """A world prepared once, from which the surfaces at any time are computed."""
+    """A world whose static parts and light are computed once, for the surfaces at any time."""
 
     def __init__(self, world: World, atlas: Atlas) -> None:
         self.atlas = atlas

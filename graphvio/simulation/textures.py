@@ -1,7 +1,7 @@
 """Procedural reflectance maps of all surfaces, packed with their mipmaps into one array that the renderer samples.
 
-Every texture is square, its side a power of two, repeats without a seam where it is meant to be tiled, and
-holds diffuse reflectance between 0 and 1. Row 0 is the top. The maps are the same at every call.
+Every texture is square with a side that is a power of two, and holds diffuse reflectance between 0 and 1. Textures that
+are tiled repeat without a seam. Row 0 is the top. The maps are the same at every call.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Atlas:
 
 
 def pack(maps: dict[str, tuple[Map, float]]) -> Atlas:
-    """Pack named maps, each (side, side) with the metres that one repetition covers, into an atlas."""
+    """Pack named maps into an atlas; each is an array (side, side) and the metres that one repetition covers."""
     levels = max(int(m.shape[0]).bit_length() for m, _ in maps.values())
     offsets = np.zeros((len(maps), levels), dtype=np.int64)
     chunks: list[Map] = []
@@ -74,7 +74,7 @@ def standard_atlas() -> Atlas:
 
 
 def checkerboard(squares: int) -> Map:
-    """Make a map (SIDE, SIDE) of ``squares`` by ``squares`` fields, dark and bright."""
+    """Make a map (SIDE, SIDE) of ``squares`` by ``squares`` alternately dark and bright fields."""
     row = np.arange(SIDE) * squares // SIDE
     return np.where((row[:, None] + row[None, :]) % 2 == 0, 0.12, 0.85).astype(np.float32)
 
@@ -98,7 +98,10 @@ def _concrete(rng: Rng) -> Map:
 
 
 def _cells(rng: Rng, rows: int, columns: int, joint: int, shift: bool, spread: float) -> tuple[Map, Map]:
-    """Sample fields of random brightness in a running bond, and the mask (SIDE, SIDE) of the joints between them."""
+    """Sample a map (SIDE, SIDE) of fields of random brightness, and the mask (SIDE, SIDE) of the joints between them.
+
+    With ``shift`` every second row is displaced by half a field, as in a brick wall.
+    """
     y, x = np.mgrid[0:SIDE, 0:SIDE]
     row = y * rows // SIDE
     offset = (row % 2) * (SIDE // columns // 2) if shift else 0
@@ -300,5 +303,5 @@ _PAINTERS: dict[str, tuple[Callable[[Rng], Map], float]] = {
     "stripes": (_stripes, 0.8),
     "head": (_head, 0.3),
     "checkerboard": (lambda rng: checkerboard(8), 0.8),
-    **OUTDOOR_PAINTERS,  # new ones come last: a place in this order is the seed of a texture
+    **OUTDOOR_PAINTERS,  # append new ones at the end: the position in this order is the seed of a texture
 }

@@ -1,7 +1,7 @@
 """Worlds of textured rectangles, some of them on moving parts, and scenes: a world with a motion through it.
 
-Frame ``world``: z up, metres. A rectangle runs from its upper left corner along ``edge_u`` (to the right, as
-seen from the side that is looked at) and ``edge_v`` (down); ``edge_v x edge_u`` points to that viewer.
+Frame ``world``: z up, metres. A rectangle extends from its upper left corner along ``edge_u`` (to the right, for a
+viewer of its front side) and ``edge_v`` (down); ``edge_v x edge_u`` points to that viewer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graphvio.simulation.motion import Motion
 Point = tuple[float, float]
 
 _POSTER_STANDS_OUT_M = 0.008
-_POSTER_STEP_M = 0.0015  # posters that overlap must not lie in one plane
+_POSTER_STEP_M = 0.0015  # difference between the distances of two posters, as overlapping ones must not share a plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class Rectangle:
         edge_v: (3,) down, metres.
         texture: name in the atlas.
         fit: whether the texture is scaled to the rectangle instead of repeated.
-        shift: (2,) of a repeated texture, in repetitions.
+        shift: (2,) shift of a repeated texture, in repetitions.
         tint: factor of the reflectance.
         lit_evenly: whether the light on it is constant, without lamps and shadows, for walls without features.
-        casts_shadow: whether it blocks lamps.
+        casts_shadow: whether it blocks the light of lamps.
     """
 
     origin: Float
@@ -57,7 +57,7 @@ class Rectangle:
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A lamp that shines in all directions: position (3,) in metres, and its light at one metre."""
+    """A lamp that shines in all directions: position (3,) in metres, and power."""
 
     position: Float
     power: float
@@ -65,7 +65,7 @@ class Lamp:
 
 @dataclass(frozen=True, eq=False)
 class MovingPart:
-    """Rectangles in a frame ``part`` of their own, and ``world_T_part`` (4, 4) at a time in seconds."""
+    """Rectangles in their own frame ``part``, and a function that returns ``world_T_part`` (4, 4) at a time (s)."""
 
     rectangles: tuple[Rectangle, ...]
     world_T_part: Callable[[float], Float]
@@ -76,7 +76,7 @@ class World:
     """A collection of surfaces and lamps, built up by the methods below.
 
     Attributes:
-        rectangles: static ones.
+        rectangles: static rectangles.
         moving: moving parts.
         lamps: light sources.
         ambient: light from all directions, as a fraction of full light.
@@ -90,7 +90,7 @@ class World:
     _shifts: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
 
     def wall(self, start: Point, end: Point, z0: float, z1: float, texture: str, tint: float = 1.0) -> None:
-        """Add a vertical wall, seen from the right of the way from start to end."""
+        """Add a vertical wall, whose front is on the right-hand side of the line from start to end."""
         a, b = np.array([*start, z1]), np.array([*end, z1])
         self._add(a, b - a, np.array([0.0, 0.0, z0 - z1]), texture, tint)
 
@@ -110,7 +110,7 @@ class World:
         self._add(np.array([x[0], y[0], z]), edge_u, edge_v, texture, 1.0)
 
     def poster(self, start: Point, end: Point, z0: float, z1: float, texture: str, tint: float = 1.0) -> None:
-        """Add a flat object on a wall between two points of its line, in the wall's direction."""
+        """Add a flat object on a wall, from one point of the wall's line to another, in the wall's direction."""
         a, b = np.array([*start, z1]), np.array([*end, z1])
         right = (b - a) / np.linalg.norm(b - a)
         self._posters += 1
@@ -127,7 +127,7 @@ class World:
         front: str | None = None,
         tint: float = 1.0,
     ) -> None:
-        """Add a box by its lower face's centre and its size, turned by yaw; ``front`` is the texture of its x faces."""
+        """Add a box with a given centre of its lower face, size and yaw; ``front`` is the texture of its x faces."""
         world_T_box = se3(rotation_zyx(yaw, 0.0, 0.0), np.array(centre))
         u, v = self._shifts.random(2)
         self.rectangles += [placed(face, world_T_box) for face in box_faces(size, texture, front, tint, (u, v))]
@@ -152,7 +152,15 @@ def box_faces(
     tint: float = 1.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Rectangle, ...]:
-    """Return the faces of a box whose lower face is centred on the origin; ``front`` is scaled to its x faces."""
+    """Return the faces of a box whose lower face is centred on the origin.
+
+    Args:
+        size: along x, y and z, metres.
+        texture: name of the texture.
+        front: texture that is scaled to each of the two x faces; None for ``texture`` on these, too.
+        tint: factor of the reflectance.
+        shift: shift of the repeated texture, in repetitions.
+    """
     hx, hy, height = 0.5 * size[0], 0.5 * size[1], size[2]
     ring = [(-hx, -hy), (hx, -hy), (hx, hy), (-hx, hy)]  # counterclockwise: the outside is to the right
     faces = []
@@ -169,7 +177,7 @@ def box_faces(
 
 @dataclass(frozen=True)
 class Exposure:
-    """Light of the scene (1 is full), and gain of the automatic exposure."""
+    """Light of the scene (1 is full light), and gain of the camera's automatic exposure."""
 
     light: float
     gain: float
@@ -185,13 +193,13 @@ class Scene:
     """A world, a motion through it and its light over time.
 
     Attributes:
-        name: as on the command line.
+        name: name of the scene, as on the command line.
         world: surfaces and lamps.
-        motion: of the body; its duration is the recording's.
+        motion: motion of the body; its duration is the recording's.
         exposure: returns light and gain at a time in seconds.
-        events: name -> (start, end), in seconds, of the scene's hard moments.
-        rig: name of its own rig, one of `graphvio.simulation.named_rigs.NAMED_RIGS`.
-        rate_hz: of its own rig, framesets per second.
+        events: difficult moments of the scene: name -> (start, end), in seconds.
+        rig: name of the scene's own rig, one of `graphvio.simulation.named_rigs.NAMED_RIGS`.
+        rate_hz: framesets per second of that rig.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Live view and recording of a run, by way of rerun (the extra ``viewer``)."""
+"""Live view and recording of a run with rerun (the extra ``viewer``)."""
 
 from graphvio.viewer.processes import WebOptions
 from graphvio.viewer.viewer import Viewer, check_display

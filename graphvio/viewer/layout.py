@@ -22,12 +22,12 @@ STATUS_COLOURS = {
 
 
 def as_entity(name: str) -> str:
-    """Return a part of an entity's path for a name."""
+    """Convert a name to a part of an entity's path: characters that are not alphanumeric become ``_``."""
     return "".join(c if c.isalnum() else "_" for c in name)
 
 
 def blueprint(rig: Rig) -> Any:
-    """Lay out the world on the left, and left cameras, curves and events on the right."""
+    """Return rerun's layout: the world on the left; left cameras, curves and events on the right."""
     cameras = [
         rrb.Spatial2DView(origin=f"world/rig/{group.left.name}", name=f"{group.name}: {group.left.name}")
         for group in rig.groups

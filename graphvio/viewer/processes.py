@@ -1,6 +1,6 @@
-"""Rerun's programs as processes of their own: its window, which stays when this one ends, and the server of browsers.
+"""Rerun's programs in their own processes: its window, which stays open when this process ends, and its web server.
 
-Within a program rerun (0.41) would listen on all addresses, without a password.
+When run inside this process, rerun (0.41) would listen on all addresses, without a password.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphvio.errors import GraphvioError
 _HOST = "127.0.0.1"
 _WINDOW_PORT = 9876
 WINDOW_URL = f"rerun+http://{_HOST}:{_WINDOW_PORT}/proxy"
-"""Address of the window's data."""
+"""Address to which the window's data is sent."""
 
 _WINDOW_S, _SURE_S = 8.0, 1.0
 _START_S, _END_S = 20.0, 5.0
@@ -32,13 +32,15 @@ _SCRIPT = 'trap : TERM; "$@" & read -r _; kill -TERM 0; wait'
 
 @dataclass(frozen=True)
 class WebOptions:
-    """Ports and memory of the server, which listens on this machine only; use an SSH tunnel for both ports elsewhere.
+    """Ports and memory of the web server.
+
+    The server listens on this machine only; from another one, use an SSH tunnel for both ports.
 
     Raises:
         GraphvioError: if a value is out of range.
     """
 
-    port: int = 9090  # of the page; its data is on the next one, ``data_port``
+    port: int = 9090  # port of the page; the next one, ``data_port``, serves its data
     memory_mb: int = 512  # data kept for browsers that connect later; the oldest is dropped
 
     def __post_init__(self) -> None:
@@ -51,22 +53,22 @@ class WebOptions:
 
     @property
     def data_port(self) -> int:
-        """Port of the data."""
+        """Port of the server's data."""
         return self.port + 1
 
     @property
     def data_url(self) -> str:
-        """Address of the data."""
+        """Address of the server's data."""
         return f"rerun+http://{_HOST}:{self.data_port}/proxy"
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """Address of the page, for a browser."""
         return f"http://{_HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
 
 
 class WebHost:
-    """The server process; ends by `close`, or with this process.
+    """The process of the web server; it ends at `close`, or when this process ends.
 
     Raises:
         GraphvioError: if a port is taken, or rerun does not start.
@@ -95,7 +97,7 @@ class WebHost:
             raise
 
     def close(self) -> None:
-        """End the process; idempotent."""
+        """End the process; a second call does nothing."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
@@ -115,10 +117,10 @@ class WebHost:
 
 
 def open_window() -> None:
-    """Open a window, unless one is open, and wait until it answers.
+    """Open rerun's window, unless one is open, and wait until it answers.
 
     Raises:
-        RuntimeError: if it does not, as without a usable display.
+        RuntimeError: if it does not answer, as without a usable display.
         OSError: if rerun cannot be executed.
     """
     if not _answers(_WINDOW_PORT):
@@ -140,7 +142,7 @@ def open_window() -> None:
 
 
 def window_command(port: int) -> list[str]:
-    """Return the command of a window that takes data on a port of this machine only."""
+    """Return the command that opens a window, which receives data on a port of this machine only."""
     return [
         *(*_rerun_program(), "--bind", _HOST, "--port", str(port), "--expect-data-soon"),
         *("--memory-limit", "75%", "--server-memory-limit", "1GiB"),
@@ -148,7 +150,10 @@ def window_command(port: int) -> list[str]:
 
 
 def _rerun_program() -> list[str]:
-    """Find rerun's program, as the beginning of a command; its Python launcher would end before it."""
+    """Return the beginning of a command that runs rerun: its program, or if it is not found, its Python launcher.
+
+    The program is preferred, since the launcher would end before it.
+    """
     package = find_spec("rerun_cli")
     program = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
     return [str(program)] if program is not None and program.is_file() else [sys.executable, "-m", "rerun_cli"]

@@ -3,16 +3,16 @@
 | entity | contents |
 |---|---|
 | ``world/rig`` | pose of body in nav |
-| ``world/rig/<camera>`` | pinhole; below it ``image`` and ``corners`` (left cameras) |
+| ``world/rig/<camera>`` | pose and pinhole model; for left cameras also ``image`` and ``corners`` below it |
 | ``world/rig/uncertainty`` | ellipsoid of three standard deviations of the position |
 | ``world/trajectory/<epoch>/<n>`` | the n-th segment of the path, coloured by status |
-| ``rates/<axis>/<source>`` | angular rate of body by gyro, vision and fused, rad/s (figure 5 of the paper) |
-| ``biases/gyro``, ``biases/accel`` | rad/s, m/s^2 |
+| ``rates/<axis>/<source>`` | angular rate of body from gyro, vision and their fusion, rad/s (figure 5 of the paper) |
+| ``biases/gyro``, ``biases/accel`` | biases of gyro, rad/s, and accelerometer, m/s^2 |
 | ``points/<pair>/candidates``, ``inliers`` | number of points |
 | ``residuals/<pair>/joint``, ``own`` | rms reprojection error, px, under the selected motion and the pair's own |
-| ``timing/<stage>`` | milliseconds |
+| ``timing/<stage>`` | processing time of a stage, milliseconds |
 | ``calibration/<group>/<curve>`` | difference from the rig file, with one standard deviation below and above |
-| ``events`` | changes of status, gates, resets, faults |
+| ``events`` | changes of status, rejections by gates, resets, faults |
 
 The timeline ``time`` is relative to the first stamp.
 """
@@ -57,11 +57,11 @@ _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
 
 
 class Recording:
-    """A stream to rerun's window, browsers, a file or several of these; methods are called by one thread.
+    """A stream to rerun's window, to browsers, to a file or to several of these; methods are called by one thread.
 
     Raises:
         GraphvioError: if browsers cannot be served.
-        OSError, RuntimeError: by rerun, if the file or the window cannot be opened.
+        OSError, RuntimeError: raised by rerun, if the file or the window cannot be opened.
     """
 
     def __init__(self, rig: Rig, *, spawn: bool, save: Path | None, web: WebOptions | None = None) -> None:
@@ -94,7 +94,7 @@ class Recording:
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
-            if self._is_saved and "gRPC" not in str(error):  # a window or browser may have been closed
+            if self._is_saved and "gRPC" not in str(error):  # a gRPC error may come from a window that was closed
                 raise
         finally:
             self._stream.disconnect()
@@ -102,7 +102,7 @@ class Recording:
                 self._web.close()
 
     def add_estimates(self, estimates: Sequence[Estimate]) -> None:
-        """Log poses, scalars and changes of status."""
+        """Log the poses, covariances, curves and changes of status of estimates."""
         if not estimates:
             return
         if self._start_ns is None:
@@ -138,7 +138,7 @@ class Recording:
             self._stream.log(_entity_of(curve), rr.Scalars([value, value - sigma, value + sigma]))
 
     def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
-        """Log left images with their corners, inliers in green."""
+        """Log the left images of a frameset with their corners, inliers in green, others in red."""
         self._at(frameset.stamp_ns)
         for index, images in frameset.images.items():
             camera = f"world/rig/{self._rig.groups[index].left.name}"
@@ -153,7 +153,7 @@ class Recording:
                 self._stream.log(f"{camera}/corners", corners)
 
     def add_path(self, name: str, trajectory: Trajectory, colour: tuple[int, int, int]) -> None:
-        """Log another trajectory, visible at all times."""
+        """Log another trajectory, which is visible at all times of the timeline."""
         strip = rr.LineStrips3D([trajectory.positions], colors=[colour], radii=rr.Radius.ui_points(1.0))
         self._stream.log(f"world/{name}", strip, static=True)
 
@@ -194,7 +194,7 @@ class Recording:
             self._send("world/rig/uncertainty", with_covariance, spheres)
 
     def _send_curves(self) -> None:
-        """Log scalars over time, one message per curve."""
+        """Log the curves of all estimates that have not been logged, one message per curve."""
         estimates, self._unsent = self._unsent, []
         for source in RATE_COLOURS:
             for k, axis in enumerate(AXES):
@@ -211,7 +211,7 @@ class Recording:
                 self._send_scalars(entity.format(name), estimates, reported)
 
     def _send_scalars(self, entity: str, estimates: Sequence[Estimate], all_values: Sequence[Any]) -> None:
-        """Log the values of estimates, numbers or vectors (3,), that are not None."""
+        """Log one value per estimate, a number or a vector (3,), where it is not None."""
         known = [(e, v) for e, v in zip(estimates, all_values, strict=True) if v is not None]
         if not known:
             return
@@ -226,7 +226,7 @@ class Recording:
         self._stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=since)], columns)
 
     def _extend_path(self, posed: Sequence[Estimate]) -> None:
-        """Log the path in segments of bounded length, so that the cost per pose does not grow."""
+        """Extend the path and log it; it is split into segments of at most 100 poses, so that costs do not grow."""
         for estimate in posed:
             if estimate.epoch != self._epoch:
                 self._log_segment()
@@ -238,7 +238,7 @@ class Recording:
         self._log_segment()
 
     def _log_segment(self) -> None:
-        """Log the newest segment again, at the time of its last pose."""
+        """Log the whole newest segment at the time of its last pose, in place of its shorter version."""
         strips: list[list[Float]] = []
         colours: list[tuple[int, int, int]] = []
         for (_, before, _), (_, position, status) in zip(self._segment, self._segment[1:], strict=False):
@@ -261,7 +261,7 @@ class Recording:
 
 
 def ellipsoid(covariance: Float) -> tuple[Float, Float]:
-    """Compute half axes (3,) of three standard deviations, metres, and their frame as quaternion ``x y z w``."""
+    """Compute a position's ellipsoid of three standard deviations: half axes (3,) and their quaternion ``x y z w``."""
     variances, axes = np.linalg.eigh(covariance)
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] = -axes[:, 0]

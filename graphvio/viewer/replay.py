@@ -24,7 +24,7 @@ _UPPER = np.triu_indices(6)
 def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> None:
     """Show poses, covariances, biases, events and the smoothed trajectory of a result folder, in a window or a file.
 
-    Files other than the trajectory may be missing.
+    Only ``trajectory.txt`` and ``rig.yaml`` are required; other files may be missing.
 
     Raises:
         GraphvioError: if the folder holds no results, a file is damaged, or the viewer cannot be opened.
@@ -44,7 +44,7 @@ def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> No
 
 
 def read_estimates(folder: Path) -> Iterator[Estimate]:
-    """Read the estimates that have a pose from the files of a result folder; their status is not saved."""
+    """Read the estimates with a pose from a result folder; their status, which is not saved, is set to tracking."""
     trajectory = load_trajectory(folder / "trajectory.txt")
     covariances = {stamp: _symmetric(upper) for stamp, upper in _read_rows(folder / "covariance.csv", 21)}
     biases = dict(_read_rows(folder / "imu_bias.csv", 6))

@@ -1,7 +1,7 @@
 """Shows a run in rerun's window or in browsers, or saves it to a file, without delaying the odometry.
 
-A thread logs to rerun. When it is slower than the odometry, images are left out (one frameset is pending, and the
-latest replaces it), but no pose, scalar or message.
+A thread logs to rerun. When it is slower than the odometry, images are left out: only the newest frameset waits to be
+logged, and replaces an older one. Poses, curves and messages are never left out.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _ROUND_S = 0.03
 
 
 class Viewer:
-    """Shows a run in a window, in browsers, or saves it to a file, or several of these; a context manager.
+    """Shows a run in a window or in browsers, saves it to a file, or does several of these; a context manager.
 
     Args:
-        rig: cameras to be shown.
+        rig: rig whose cameras are shown.
         spawn: open rerun's window and stream to it.
         save: file (``.rrd``) to save a recording to; needs no display.
         web: serve browsers at ``web.url`` until the viewer is closed; needs no display.
@@ -65,16 +65,16 @@ class Viewer:
         try:
             self.close()
         except GraphvioError:
-            if kind is None:  # otherwise the first error matters more
+            if kind is None:  # otherwise the error that ended the context is raised
                 raise
 
     @property
     def url(self) -> str | None:
-        """Address for a browser, or None if none is served."""
+        """Address for a browser, or None if browsers are not served."""
         return None if self._web is None else self._web.url
 
     def show(self, frameset: FrameSet | None, estimate: Estimate) -> None:
-        """Show an estimate, and the images of its frameset unless that is None; returns at once."""
+        """Show an estimate, and the images of its frameset unless ``frameset`` is None; returns at once."""
         with self._changed:
             if self._closing or self._error is not None:
                 return
@@ -93,7 +93,7 @@ class Viewer:
         self._add_extra(lambda recording: recording.add_calibration(stamp_ns, estimate))
 
     def show_path(self, name: str, path: Trajectory, colour: tuple[int, int, int] = (150, 150, 150)) -> None:
-        """Show another trajectory in nav, such as the smoothed one or truth; returns at once."""
+        """Show another trajectory in nav, such as the smoothed one or the truth; returns at once."""
         self._add_extra(lambda recording: recording.add_path(name, path, colour))
 
     def _add_extra(self, extra: Callable[[Recording], None]) -> None:
@@ -104,10 +104,10 @@ class Viewer:
             self._changed.notify()
 
     def close(self) -> None:
-        """Show what is pending, flush and end; later calls of other methods have no effect.
+        """Show all pending data, flush and end; later calls of other methods have no effect.
 
         Raises:
-            GraphvioError: if showing has failed; the recording then ends there.
+            GraphvioError: if rerun has failed; the recording then ends at that point.
         """
         with self._changed:
             self._closing = True
@@ -131,12 +131,12 @@ class Viewer:
 
     def _log(self, recording: Recording) -> None:
         while self._log_pending(recording):
-            # Frequent rounds would slow the odometry down; a batch costs as much as one estimate.
+            # More frequent rounds would slow the odometry down; a batch of estimates costs as much as one estimate.
             with self._changed:
                 self._changed.wait_for(lambda: self._closing, _ROUND_S)
 
     def _log_pending(self, recording: Recording) -> bool:
-        """Wait for pending data and log it; False when the viewer is closing and all is logged."""
+        """Wait for pending data and log it; return False when the viewer is closing and all data is logged."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing or self._estimates or self._extras)
             estimates, self._estimates = self._estimates, deque()

@@ -1,4 +1,4 @@
-"""``scripts/benchmark accuracy``: every scene and the real clip, with each profile, all pairs and each pair alone."""
+"""``scripts/benchmark accuracy``: accuracy on all scenes and the real clip, by profile, with all pairs and with one."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _FROM_PREVIOUS = "default, from the frame before"
 CLIP = DOCS.parents[1] / "shared" / "data" / "euroc_mh01_clip"
 CLIP_NAME = "EuRoC MH_01 clip"
 _PLOTTED = (("corridor", True), ("corridor", False), ("stairs", False), (CLIP_NAME, False))  # with the IMU or without
-_WITH_IMU = (DEFAULT, PAPER)  # a smoother, and the filter that it ought to beat
+_WITH_IMU = (DEFAULT, PAPER)  # profiles that use the IMU: a smoother, and the filter that it ought to beat
 AIM = 1.05
-"""All pairs' ATE over that of the better pair alone: together they are at least as good as either."""
+"""Aim for the ATE by all pairs over that by the better pair alone: together they are at least as good as either."""
 _ANGLE_DEG, _SHIFT_M = 1.0, 0.03
 _BLIND_SCENE, _BLIND_S, _BLIND_FROM_S = "room", 5.0, 10.0
 _BLIND_FROM_SHARE, _BLIND_SHARE = 0.3, 0.4
-"""Shares of a walk that is too short for these times."""
+"""Start and length of the blind interval as shares of a walk that is too short for the times above."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -65,7 +65,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_all(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Run all cases, and write the reports and the picture."""
     for scene in args.scenes:
         if scene not in SCENES_OF_TWO_PAIRS:
             raise GraphvioError(
@@ -113,7 +113,7 @@ def run_all(args: argparse.Namespace) -> None:
 
 
 def _cases(profiles: list[str]) -> list[tuple[str, bool]]:
-    """Profiles, and whether the IMU takes part."""
+    """Return the cases of each recording: profile, and whether the IMU is used."""
     return [(profile, imu) for profile in profiles for imu in (False, True) if not imu or profile in _WITH_IMU]
 
 
@@ -136,12 +136,13 @@ def _main_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> 
 
 
 def _figures(bench: Bench) -> Report:
-    """Report what the README shows of these runs: the default configuration, by pairs, with and without the IMU."""
+    """Return the table for the README: the default profile, with all pairs and each alone, with and without the IMU."""
     names = list(dict.fromkeys(pair.name for name in bench.with_several_pairs for pair in bench.rig(name).pairs))
     rows = []
     for name in bench.recordings:
         first = bench.outcome(name, DEFAULT, bench.choices(name)[0], True)
-        # Steps of a truth at the IMU's rate add its noise: the path is that between framesets, where there are poses.
+        # The path's length is summed between framesets, if there are poses: a truth at the IMU's rate would add up its
+        # noise.
         path_m = first.truth.distances[-1] if first.evaluation is None else first.evaluation.path_length_m
         label = f"{name if name == CLIP_NAME else f'simulated {name}'}, {path_m:.0f} m"
         pairs = {p: bench.pair_names(name, p) for p in bench.choices(name)}
@@ -155,7 +156,7 @@ def _figures(bench: Bench) -> Report:
 
 
 def _figure(outcome: Outcome) -> str:
-    """ATE and drift of a run, or that its trajectory has several epochs."""
+    """Return ATE and drift of a run as text, or that there is no pose or more than one epoch."""
     if outcome.evaluation is None:
         return "no pose"
     epochs = len(np.unique(outcome.epochs))
@@ -166,7 +167,7 @@ def _figure(outcome: Outcome) -> str:
 
 
 def _together_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> None:
-    """All pairs against the better one alone, by the runs of the main table."""
+    """Add the table that compares all pairs with the better pair alone, from the runs of the main table."""
     rows = []
     for name in bench.with_several_pairs:
         together = bench.choices(name)[0]
@@ -230,7 +231,7 @@ def _filters_table(report: Report, bench: Bench) -> None:
 
 
 def _moved_table(report: Report, bench: Bench) -> None:
-    """Add the table of runs with an error in the second pair's extrinsics."""
+    """Add the table of runs with an error in the extrinsics of the second pair."""
     rows = []
     for name in bench.with_several_pairs:
         moved = with_moved_pair(bench.rig(name), 1, _ANGLE_DEG, _SHIFT_M)

@@ -1,8 +1,8 @@
-"""``scripts/benchmark backend``: the back-end's time for a frameset, and that of gtsam's fixed-lag smoother.
+"""``scripts/benchmark backend``: time per frameset of the back-end and of gtsam's fixed-lag smoother.
 
-A recording is run once, and the inputs of its back-end are logged: IMU samples and motions by vision. Then the back-end
-processes them again without a front-end, and gtsam's IncrementalFixedLagSmoother is given the factors that it made,
-frameset by frameset in turns.
+The odometry runs once over a recording, and the inputs of its back-end are logged: IMU samples and motions by vision.
+Then the back-end processes them again without a front-end, and gtsam's IncrementalFixedLagSmoother processes the
+factors that the back-end has created. The two take turns at every frameset.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def main(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the times and report them next to the aims."""
     if args.framesets < _MIN_FRAMESETS:
         raise GraphvioError(f"percentiles need framesets: give {_MIN_FRAMESETS} or more")
     folder = simulated(args.data, "room") if args.recording is None else args.recording
@@ -93,8 +93,8 @@ def main(args: argparse.Namespace) -> None:
 
 
 class _Timing(NamedTuple):
-    """Milliseconds for each counted frameset, distance of the two newest positions, and whether ours solved the whole
-    window."""
+    """Values for each counted frameset: times in milliseconds, the distance between the newest positions of both
+    smoothers in metres, and whether ours solved the whole window."""
 
     ours_ms: Float
     theirs_ms: Float
@@ -126,21 +126,21 @@ def _timed(stream: Stream, lag_s: float) -> _Timing:
 
 
 class _Incremental:
-    """gtsam's incremental fixed-lag smoother, with the factors of ours."""
+    """gtsam's incremental fixed-lag smoother, which is given the factors of our smoother."""
 
     def __init__(self, lag_s: float) -> None:
         params = gtsam.ISAM2Params()
-        params.setFactorization("QR")  # it throws on some graphs with its default
+        params.setFactorization("QR")  # with the default, it throws on some graphs
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag_s, params)
         self._known: set[int] = set()
 
     def step(self, stamp_ns: int, newest: int, references: list[int], added: Added) -> tuple[float, float, Float]:
-        """Return the seconds for the newest pose and for its covariance, and its position (3,).
+        """Update with the newest state; return the seconds for its pose and for its covariance, and its position (3,).
 
         Args:
-            stamp_ns: of the newest state.
-            newest: number of that state.
-            references: numbers of the states that later motions are measured from: they must not leave.
+            stamp_ns: stamp of the newest state.
+            newest: number of the newest state.
+            references: numbers of the states from which later motions are measured: they must stay in the window.
             added: factors and new variables.
         """
         now_s = stamp_ns / _NS_PER_S

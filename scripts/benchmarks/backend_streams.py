@@ -1,4 +1,4 @@
-"""Logs of the back-end: its inputs over a run, so that it can be repeated, and the factors that it makes."""
+"""Logs of the back-end: its inputs over a run, so that it can process them again, and the factors that it creates."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Stream:
     """Inputs of the back-end for each frameset of a recording.
 
     Attributes:
-        rig: of the recording.
-        framesets: the calls for each, the last of which is ``update``.
-        prediction_us: time of `Odometry.predict` at each sample of the IMU beyond the newest frameset.
+        rig: rig of the recording.
+        framesets: for each frameset, the calls of the back-end's methods; the last of them is ``update``.
+        prediction_us: times of `Odometry.predict` at the IMU samples after the newest frameset, microseconds.
     """
 
     rig: Rig
@@ -46,7 +46,7 @@ class Stream:
 
 
 def log_stream(folder: Path, most: int) -> Stream:
-    """Run the odometry on the first framesets of a recording, and log the calls of its back-end."""
+    """Run the odometry on the first ``most`` framesets of a recording, and log the calls of its back-end."""
     source = open_source(folder)
     odometry = Odometry(source.rig)
     framesets: list[list[Call]] = [[]]
@@ -54,7 +54,7 @@ def log_stream(folder: Path, most: int) -> Stream:
     for name in _STEPS:
         _log_calls(estimator, name, framesets)
     prediction_us = []
-    # Decoded before, so that no decoding threads run meanwhile.
+    # All images are decoded first, so that no decoding threads run meanwhile.
     for measurement in list(takewhile(_before(most), source)):
         odometry.process(measurement)
         if isinstance(measurement, ImuSample):
@@ -66,7 +66,7 @@ def log_stream(folder: Path, most: int) -> Stream:
 
 
 def _before(most: int) -> Callable[[Measurement], bool]:
-    """Return a predicate that is true until so many framesets have passed."""
+    """Return a predicate that is true until it has seen ``most`` framesets."""
     framesets = count()
     return lambda measurement: not isinstance(measurement, FrameSet) or next(framesets) < most
 
@@ -89,7 +89,7 @@ class Added(NamedTuple):
     """Factors and variables that the smoother inserted for a frameset.
 
     Attributes:
-        factors: in the order in which they were inserted.
+        factors: the factors, in the order in which they were inserted.
         values: the new variables, with their predicted values.
     """
 
@@ -98,7 +98,7 @@ class Added(NamedTuple):
 
 
 class FactorLog:
-    """Log of the factors that all smoothers created after it insert."""
+    """Log of the factors that are inserted by all smoothers that are created after the log."""
 
     def __init__(self) -> None:
         self._added = Added(gtsam.NonlinearFactorGraph(), gtsam.Values())

@@ -1,4 +1,4 @@
-"""The runs of the accuracy benchmark: recordings, configurations and pairs, each combination run once."""
+"""The runs of the accuracy benchmark: each combination of recording, configuration and pairs is run only once."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import open_source
 
 CLIP_TRUTH = TruthNoise(angle_rad=3e-4, position_m=1e-3)
-"""Assumed for a real recording, about right for a laser tracker fused with an IMU."""
+"""Noise of the truth that is assumed for a real recording; about right for a laser tracker fused with an IMU."""
 
 
 @dataclass
 class Bench:
-    """The recordings and configurations, and what has been run already."""
+    """The recordings and configurations by name, and the outcomes of the runs so far."""
 
     recordings: dict[str, Path]
     configs: dict[str, Config]
@@ -42,7 +42,7 @@ class Bench:
         return " + ".join(self.rig(recording).pairs[j].name for j in pairs)
 
     def better_single(self, recording: str, profile: str, imu: bool) -> tuple[str, Outcome]:
-        """Return the pair with the least ATE by epoch alone, and its run."""
+        """Return the name of the pair that, alone, has the least ATE with epochs aligned separately, and its run."""
         _, *alone = self.choices(recording)
         runs = {self.pair_names(recording, p): self.outcome(recording, profile, p, imu) for p in alone}
         best = min(runs, key=lambda name: runs[name].epoch_ate_m)
@@ -54,18 +54,18 @@ class Bench:
 
     @property
     def with_several_pairs(self) -> list[str]:
-        """The recordings of more than one pair."""
+        """Names of the recordings with more than one pair."""
         return [name for name in self.recordings if len(self.rig(name).pairs) > 1]
 
     def outcome(self, recording: str, profile: str, pairs: tuple[int, ...], imu: bool) -> Outcome:
-        """Return the run of a case, which is made once."""
+        """Return the outcome of a case, which is run when it is first asked for."""
         key = (recording, profile, pairs, imu)
         if key not in self._done:
             self._done[key] = self.special(recording, profile, self.rig(recording).with_pairs(pairs), imu)
         return self._done[key]
 
     def special(self, recording: str, profile: str, rig: Rig, imu: bool, alter: Alter | None = None) -> Outcome:
-        """Run with another rig or other images."""
+        """Run a recording with the given rig, and with images altered by ``alter`` if it is given."""
         used = rig if imu else rig.without_imu()
         noise = EXACT if recording in SCENE_NAMES else CLIP_TRUTH
         outcome = run(self.recordings[recording], used, self.configs[profile], alter, noise)

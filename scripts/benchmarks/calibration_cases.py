@@ -1,4 +1,4 @@
-"""The cases of the calibration-error benchmark and their results, in a CSV file from which it can go on."""
+"""The cases of the calibration-error benchmark, and their results in a CSV file, from which it can be continued."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from benchmarks.report import writing
 from graphvio.errors import GraphvioError
 
 EXACT = 0
-"""The level of exact files."""
+"""Level of calibration error of exact files."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run: the columns of the CSV file by which it is found again.
+    """Settings of one run: the columns of the CSV file that identify it.
 
     Attributes:
-        scene: name.
-        duration_s: of the recording, or ``whole``.
-        rig_change: of the true rig, or ``none``.
-        level: of the calibration error, or `EXACT`.
-        components: of the calibration error, or ``all``.
-        seed: by which it was sampled.
+        scene: name of the scene.
+        duration_s: duration of the recording, or ``whole``.
+        rig_change: change of the true rig during the walk, or ``none``.
+        level: level of the calibration error, or `EXACT`.
+        components: components of the calibration error, or ``all``.
+        seed: seed with which the calibration error was sampled.
         config: profile, and the values that were set.
-        pairs: which took part; ``none`` where each camera is single, ``one-camera`` of one alone.
-        imu: ``yes`` or ``no``.
+        pairs: pairs that were used; ``none`` if each camera is single, ``one-camera`` if only one camera is used.
+        imu: whether the IMU was used, ``yes`` or ``no``.
     """
 
     scene: str
@@ -43,7 +43,7 @@ class Case:
 
     @property
     def key(self) -> tuple[str, ...]:
-        """The values as texts."""
+        """The values of all settings as texts."""
         return tuple(str(value) for value in vars(self).values())
 
 
@@ -62,10 +62,10 @@ _FIGURES = (
 
 
 def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
-    """Add a run to a CSV file, which is made if it is missing.
+    """Append a run to a CSV file, which is created if it is missing.
 
     Raises:
-        GraphvioError: if it cannot be written.
+        GraphvioError: if the file cannot be written.
     """
     with writing(path):
         is_new = not path.exists()
@@ -86,7 +86,7 @@ def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
 
 
 def load_outcomes(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
-    """Return the runs in a CSV file by `Case.key`; of equal ones the last.
+    """Return the runs in a CSV file by `Case.key`; of runs with the same key the last.
 
     Raises:
         GraphvioError: if the file has other columns.

@@ -1,4 +1,4 @@
-"""By how much a rig's calibration is off, in the terms of the simulation's calibration errors."""
+"""Differences of a rig's calibration from the true one, in the parameters of the simulation's calibration errors."""
 
 import numpy as np
 
@@ -8,16 +8,16 @@ from graphvio.rig import Rig
 
 
 def calibration_differences(rig: Rig, true_rig: Rig) -> dict[str, Float]:
-    """Return by how much a rig's calibration is off, in the terms in which the simulation makes errors.
+    """Return the errors of a rig's calibration, in the parameters of the simulation's calibration errors.
 
     Args:
-        rig: such as a file says, or estimated.
-        true_rig: of the same cameras.
+        rig: rig with the calibration of a file, or an estimated one.
+        true_rig: true rig with the same cameras.
 
     Returns:
         Name with unit, as in the simulation's `CalibrationErrorSizes` -> errors (K,) of all cameras, pairs and axes.
-        Without an IMU in both rigs there is no ``time_offset_ms``, without pairs no stereo extrinsics, and without a
-        second pair, or another single camera, none of its extrinsics.
+        Without an IMU in both rigs there is no ``time_offset_ms``, without pairs there are no stereo extrinsics, and
+        without a second pair or another single camera no extrinsics between them.
     """
     cameras = list(zip(rig.cameras, true_rig.cameras, strict=True))
     ratios = np.array([camera.intrinsics[:2] / true.intrinsics[:2] for camera, true in cameras])

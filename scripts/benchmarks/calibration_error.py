@@ -1,4 +1,4 @@
-"""``scripts/benchmark calibration-error``: accuracy when the calibration files are as wrong as real ones."""
+"""``scripts/benchmark calibration-error``: accuracy with calibration files that are as wrong as real ones."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_all(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Run all cases, or with ``--resume`` those that the file of results lacks, and report."""
     for scene in args.scenes:
         if scene not in SCENE_NAMES:
             raise GraphvioError(f"there is no scene {scene!r}; choose from {', '.join(SCENE_NAMES)}")
@@ -125,14 +125,14 @@ def run_all(args: argparse.Namespace) -> None:
 
 
 def _docs_table(pairs: set[str]) -> str:
-    """Return the name of the table in the docs for the cameras that took part."""
+    """Return the name of the table in the docs for the choices of cameras that were run."""
     if "front+single" in pairs:
         return "calibration-error-beside"
     return "calibration-error" if pairs & set(_PAIRS) else "calibration-error-singles"
 
 
 def _rendered(args: argparse.Namespace, scene: str) -> Path:
-    """Return the folder of a scene's recording with exact files."""
+    """Return the folder of a scene's recording, with exact files."""
     if args.recordings is None:
         return simulated(args.data, scene, args.duration, args.rig_change)
     folder: Path = args.recordings / (scene if args.rig_change is None else f"{scene}-{args.rig_change}")
@@ -147,7 +147,7 @@ def _error(level: int, components: Sequence[str] | None) -> CalibrationErrorSize
 
 
 def _config(profile: str, assignments: Sequence[str]) -> Config:
-    """Load a profile and change some values."""
+    """Load a profile and change values by assignments such as ``smoother.lag_s=3``."""
     values = yaml.safe_load(Config.load(profile).to_yaml())
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
@@ -159,14 +159,14 @@ def _config(profile: str, assignments: Sequence[str]) -> Config:
 
 
 def _draws(levels: Sequence[int], first_seed: int, seeds: int) -> Iterator[tuple[int, int]]:
-    """Yield level and seed of each draw; exact files have only one."""
+    """Yield the level and the seed of each sampled calibration error; for exact files there is only one."""
     for level in levels:
         for seed in range(first_seed, first_seed + (1 if level == EXACT else seeds)):
             yield level, 0 if level == EXACT else seed
 
 
 def _choices(folder: Path, pairs: Sequence[str]) -> list[str]:
-    """Return those choices of cameras that a recording has; of a single pair ``both`` is all, and the only pair."""
+    """Return the choices of cameras that are possible in a recording; with a single pair, ``both`` means this pair."""
     if len(open_source(folder).rig.pairs) > 1:
         return list(pairs)
     return [each for each in pairs if each in (_BOTH, "none", "one-camera")]
@@ -186,7 +186,7 @@ def _cases(args: argparse.Namespace, scene: str, level: int, seed: int, chosen: 
 
 
 def _selected(rig: Rig, case: Case) -> Rig:
-    """Return the part of a rig that a case runs."""
+    """Return the part of a rig that a case uses."""
     n_cameras = {"one-camera": 1, "front+single": 3}.get(case.pairs)
     if n_cameras is not None:
         return rig.with_only([camera.name for camera in rig.cameras[:n_cameras]])
@@ -208,7 +208,7 @@ def _line(case: Case, outcome: CalibrationOutcome) -> str:
 
 
 def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
-    """Print the accuracy of each scene and level, and the errors of the parameters before and after."""
+    """Add the tables of accuracy by scene and level, and of the parameters' errors before and after estimation."""
     of_pairs = {case: outcome for case, outcome in results.items() if case.pairs in _PAIRS}
     of_singles = {case: outcome for case, outcome in results.items() if case.pairs in _SINGLES}
     if of_pairs:
@@ -288,7 +288,7 @@ def _tables_of_singles(report: Report, results: Mapping[Case, CalibrationOutcome
 
 
 def _table_of_parameters(report: Report, by: str, head: list[str], rows: list[list[str]]) -> None:
-    """Add what the odometry estimated by some cameras, unless all files were exact."""
+    """Add the table of the parameters that the odometry estimated with some cameras, unless all files were exact."""
     if not rows:
         return
     report.add(
@@ -307,7 +307,7 @@ def _are_wrong(outcomes: Sequence[CalibrationOutcome]) -> bool:
 
 
 def _accuracy_cells(runs: dict[str, dict[int, CalibrationOutcome]], exact: CalibrationOutcome | None) -> list[str]:
-    """The cells of a row from the number of draws on, by the runs of each choice of pairs and seed."""
+    """Return the cells of a row from the number of samples on; ``runs`` is choice of pairs -> seed -> outcome."""
     both, front, back = (runs[pairs] for pairs in _PAIRS)
     against_exact = "-"
     if both and exact is not None:

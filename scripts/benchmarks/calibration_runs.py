@@ -1,4 +1,4 @@
-"""One run of the odometry with a wrong calibration, on images that were rendered once."""
+"""Runs of the odometry with wrong calibration files on a rendered recording."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
-_FRAMESETS_OF_NEES = 20  # one of so many
+_FRAMESETS_OF_NEES = 20  # the NEES is that of every 20th pose
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,17 @@ class CalibrationOutcome:
     """Result of a run.
 
     Attributes:
-        ate_m: rmse of the causal positions after alignment, all epochs as one; infinite where there are none.
-        ate_scaled_m: the same after alignment with scale, without what a wrong baseline makes of it.
-        scale_error_percent: of the estimate's lengths.
-        epochs: how many there were.
-        posed_percent: framesets that have a pose.
-        frameset_ms: mean wall time of a frameset, with its decoding.
-        pose_nees: mean over the poses of each second, of each dimension; 1 where covariances are right. NaN where a
-            second epoch begins.
+        ate_m: rmse of the causal positions after alignment of all epochs together; infinite where there are none.
+        ate_scaled_m: the same after an alignment with scale, which removes the effect of a wrong baseline.
+        scale_error_percent: error of the estimate's scale.
+        epochs: number of epochs.
+        posed_percent: share of the framesets that have a pose.
+        frameset_ms: mean wall time per frameset, including decoding.
+        pose_nees: NEES per dimension, mean over every 20th pose; 1 if covariances are right. NaN if the epoch
+            changes.
         before: parameter with unit -> rms of its errors in the files, against the true rig at the end.
-        after: the same of what the odometry estimated; nothing of what it does not estimate.
-        events: kind -> how many there were; not in the file of results.
+        after: the same for the parameters that the odometry estimated, with the estimates.
+        events: kind -> number of events; not stored in the file of results.
     """
 
     ate_m: float
@@ -65,13 +65,13 @@ class WronglyCalibrated:
     """A rendered scene whose files have a calibration error.
 
     Args:
-        folder: of the recording with exact files.
-        scene: its name.
-        duration_s: only so much of it; None for the whole walk.
-        rig_change: with which it was rendered, one of `graphvio.simulation.RIG_CHANGES`, or None.
-        error: sizes of the errors.
-        seed: by which they are sampled.
-        begin_s: where the odometry begins in it: in motion, after the scene's first second.
+        folder: folder of the recording with exact files.
+        scene: name of the scene.
+        duration_s: duration of the part that is run, in seconds; None for the whole walk.
+        rig_change: change of the rig with which it was rendered, one of `graphvio.simulation.RIG_CHANGES`, or None.
+        error: sizes of the calibration errors.
+        seed: seed with which the errors are sampled.
+        begin_s: time in the walk at which the odometry begins; after the scene's first second the rig is in motion.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class WronglyCalibrated:
         ]
 
     def run(self, config: Config, select: Callable[[Rig], Rig]) -> CalibrationOutcome:
-        """Run the odometry with what is selected of the rig."""
+        """Run the odometry with the part of the rig that ``select`` returns."""
         written, true = (select(rig) for rig in (self._written_rig, self._true_rig))
         warm_up(written, config)
         odometry = Odometry(written, config)
@@ -143,7 +143,7 @@ class WronglyCalibrated:
         )
 
     def _measurements(self, rig: Rig) -> Iterator[Measurement]:
-        """Merge the images on disk with the samples in memory."""
+        """Merge the images on disk with the IMU samples in memory."""
         source = open_source(self._folder, rig, from_s=self._begin_s, to_s=self._duration_s)
         framesets = (measurement for measurement in source if isinstance(measurement, FrameSet))
         if rig.imu is None:
@@ -152,7 +152,7 @@ class WronglyCalibrated:
 
 
 def _pose_nees(estimates: Sequence[Estimate], truth: Trajectory) -> float:
-    """Compute the mean NEES of the poses since the first one, which defines nav, for each dimension."""
+    """Compute the mean NEES per dimension of the poses after the first one, which defines the frame nav."""
     true = dict(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True))
     first, *others = [e for e in estimates if e.stamp_ns in true][::_FRAMESETS_OF_NEES]
     if not others or others[-1].epoch != first.epoch:

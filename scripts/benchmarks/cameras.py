@@ -1,4 +1,4 @@
-"""``scripts/benchmark cameras``: accuracy by what cameras a rig has, in the same scenes."""
+"""``scripts/benchmark cameras``: accuracy of rigs with different cameras in the same scenes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
-_RIGS = ("paper", "stereo", "stereo+back")  # of one recording: the paper's cameras include those of the others
+_RIGS = ("paper", "stereo", "stereo+back")  # in one recording: the paper's cameras include those of the others
 _BASE = "stereo"
 _SINGLES = "paper, no pairs"
-_OWN_RIGS = ("headset", "surround", "phone")  # each in a recording of its own
+_OWN_RIGS = ("headset", "surround", "phone")  # rigs that each have their own recording
 _CONFIGS = {"estimated": "{}", "trusted": "calibration: {online: false}"}
 
 
@@ -61,7 +61,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_all(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the accuracy of all rigs, and report."""
     if args.seeds < 1:
         raise GraphvioError("--seeds must be at least 1")
     report = Report()
@@ -74,7 +74,7 @@ def run_all(args: argparse.Namespace) -> None:
 
 
 def _compare(args: argparse.Namespace, report: Report) -> None:
-    """Add the table of rigs in one recording."""
+    """Add the table of the rigs that share one recording."""
     rigs, rows = [_BASE, *(name for name in args.rigs if name != _BASE)], []
     for scene in args.scenes:
         folders = [_rendered(args, scene, seed) for seed in range(args.seeds)]
@@ -89,7 +89,7 @@ def _compare(args: argparse.Namespace, report: Report) -> None:
 
 
 def _measure_own(args: argparse.Namespace, report: Report) -> None:
-    """Add the table of rigs in recordings of their own, and of single cameras, whose scale is the IMU's."""
+    """Add the table of the rigs with their own recordings, and of single cameras, whose scale comes from the IMU."""
     rows = []
     for scene in args.scenes:
         for name in args.own_rigs:
@@ -126,13 +126,14 @@ def _ate_of(folder: Path, name: str, config: Config) -> float:
 
 
 def ate_mm(folder: Path, rig: Rig, config: Config, from_s: float = 0.0) -> float:
-    """Run a rig's cameras and return the causal absolute trajectory error; infinite without poses."""
+    """Run the odometry with a rig and return the ATE of the causal trajectory, millimetres; infinite without poses."""
     evaluation, _ = run(folder, rig, config, from_s)
     return float("inf") if evaluation is None else 1e3 * evaluation.ate_position_m.rmse
 
 
 def run(folder: Path, rig: Rig, config: Config, from_s: float = 0.0) -> tuple[Evaluation | None, float]:
-    """Run a rig's cameras and return the causal trajectory's errors, None without poses, and the share with pose."""
+    """Run the odometry with a rig; return the causal trajectory's errors, or None without poses, and the share of
+    framesets that have a pose."""
     source = open_source(folder, rig, from_s=from_s)
     assert source.truth is not None
     warm_up(source.rig, config)

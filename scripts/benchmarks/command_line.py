@@ -1,4 +1,4 @@
-"""Common parts of the command lines of ``scripts/benchmark`` and ``scripts/campaign``."""
+"""Parts that the command lines of ``scripts/benchmark`` and ``scripts/campaign`` share."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 AddParser: TypeAlias = Callable[[Subparsers], None]
-"""Adds a subcommand's parser, whose default ``run`` takes the parsed arguments."""
+"""A function that adds a subcommand's parser; the parser's default ``run`` is called with the parsed arguments."""
 
 
 def add_command(
     subparsers: Subparsers, name: str, summary: str, description: str | None, run: Callable[[argparse.Namespace], None]
 ) -> argparse.ArgumentParser:
-    """Add a subcommand whose help is a module's docstring with its line breaks."""
+    """Add a subcommand whose help is a module's docstring, shown with its line breaks."""
     parser = subparsers.add_parser(
         name, help=summary, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -48,6 +48,6 @@ def run_command_line(prog: str, description: str, subcommands: Sequence[AddParse
 
 
 def add_report_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--out`` and ``--docs``, which also write the report to a file."""
+    """Add the options ``--out`` and ``--docs``, with which the report is also written to a file or to the docs."""
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
     parser.add_argument("--docs", action="store_true", help="write the report into docs/explanation/benchmarks")

@@ -1,4 +1,4 @@
-"""``scripts/benchmark decoding``: decoding of PNG files, beside OpenCV's decoder, and beside the odometry."""
+"""``scripts/benchmark decoding``: time of decoding PNG files, next to OpenCV's decoder, and during the odometry."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from graphvio.warmup import warm_up
 
 _ROUNDS = 5
 _DURATION_S = 20.0
-_UNTIMED = 40  # framesets at the beginning of a replay
+_UNTIMED = 40  # framesets at the beginning of a replay that are not timed
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -45,7 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the decoding times, and report."""
     folder = args.recording or simulated(args.data, "room", _DURATION_S)
     files = [path.read_bytes() for path in sorted(folder.glob("**/*.png"))[: args.images]]
     decoders: dict[str, Callable[[bytes], AnyArray]] = {
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _ms_of_one(decode: Callable[[bytes], AnyArray], files: list[bytes]) -> float:
-    """Return the processor time of one image, in milliseconds."""
+    """Return the processor time for decoding one file, milliseconds."""
     start = time.process_time()
     for data in files:
         decode(data)
@@ -74,7 +74,7 @@ def _ms_of_one(decode: Callable[[bytes], AnyArray], files: list[bytes]) -> float
 
 
 def _add_replays(report: Report, folder: Path) -> None:
-    """Add the times of the odometry while images are decoded beside it."""
+    """Add the table of the odometry's times while images are decoded in the same process or in another one."""
     config = Config.load("default")
     warm_up(open_source(folder).rig, config)
     set_up_threads()
@@ -92,7 +92,7 @@ def _add_replays(report: Report, folder: Path) -> None:
 
 
 def _ms_of_a_frameset(folder: Path, config: Config, in_process: bool) -> float:
-    """Return the mean wall time of a frameset of a recording as fast as it goes, in milliseconds."""
+    """Return the mean wall time per frameset when a recording is processed as fast as possible, milliseconds."""
     source = open_source(folder)
     source.decodes_in_process = in_process
     odometry = Odometry(source.rig, config)

@@ -1,4 +1,4 @@
-"""The cases of the campaign of faults, and the measurements that each of them feeds to the odometry."""
+"""The cases of the fault benchmark, and the measurements that the odometry receives in each of them."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from graphvio.simulation import build_scene
 from graphvio.sources import Source
 
 Intervals = tuple[tuple[float, float], ...]
-"""(start, end) in seconds since the first frameset, in order."""
+"""Intervals (start, end) in seconds since the first frameset, in order of time."""
 
 WALKS = ("room", "calibration", "stairs")
-"""Scenes that faults are put into: seed k takes the one at k modulo their number."""
+"""Scenes in which faults are simulated: seed k uses the scene at index k modulo their number."""
 
 _FIRST_S = 2.5  # the rig is stationary for a second and then accelerates for another
 _LASTS_S = (0.3, 2.2)
@@ -36,10 +36,10 @@ class Case:
     """One hard case.
 
     Attributes:
-        name: as the table and ``--cases`` know it.
-        fault: alters images for intervals of time; None where the scene itself is hard.
-        scene: where; None for the walk of the seed.
-        title: for the table.
+        name: name in the table and for ``--cases``.
+        title: description in the table.
+        fault: function that alters images in some intervals of time; None if the scene itself is hard.
+        scene: scene of the case; None for the walk that belongs to the seed.
     """
 
     name: str
@@ -48,7 +48,11 @@ class Case:
     scene: str | None = None
 
     def intervals(self, seed: int, duration_s: float) -> Intervals:
-        """When the case is hard: at once for scenes, again and again for faults, for 0.3 to 2.2 s each time."""
+        """Return the intervals in which the case is hard.
+
+        Faults come repeatedly, for 0.3 to 2.2 s each time. Hard scenes are hard all the time, except for the corridor,
+        which has intervals of its own.
+        """
         if self.name == "clean":
             return ()
         if self.scene == "corridor":
@@ -65,7 +69,7 @@ class Case:
         return tuple(intervals)
 
     def seed(self, seed: int) -> tuple[int, int]:
-        """Seed of all random values of this case."""
+        """Return the seed of all random values of this case."""
         return seed, zlib.crc32(self.name.encode())
 
 
@@ -107,19 +111,19 @@ CASES = (
 def hard_measurements(
     case: Case, seed: int, source: Source, truth: dict[int, Float], duration_s: float
 ) -> Iterator[tuple[Measurement, bool]]:
-    """The measurements of a recording with a case's faults in them, and whether each falls into a fault's interval.
+    """Yield the measurements of a recording with a case's faults, and whether each falls into a fault's interval.
 
     Args:
-        case: what is wrong.
-        seed: of all random values.
+        case: the case.
+        seed: seed of all random values.
         source: the recording; its length is ``duration_s``.
         truth: stamp -> ``world_T_body`` (4, 4), at the framesets' stamps.
-        duration_s: of the recording.
+        duration_s: length of the recording.
     """
     intervals = case.intervals(seed, duration_s)
     before: deque[Images] = deque(maxlen=_KEPT)
     stamps: list[int] = []
-    began = (-1, 0)  # the interval that lasts, and the index of its first frameset
+    began = (-1, 0)  # the current interval, and the index of its first frameset
     for measurement in source:
         since_s = (measurement.stamp_ns - source.start_ns) * 1e-9
         inside = next((k for k, (start, end) in enumerate(intervals) if start <= since_s < end), None)

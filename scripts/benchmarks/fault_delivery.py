@@ -11,7 +11,7 @@ from graphvio.arrays import Image
 
 
 def black(moment: Moment) -> Images:
-    """A pair whose images are black but for the sensor's noise."""
+    """Images of one pair that are black except for the sensor's noise."""
 
     def change(pair: int, side: int, image: Image) -> Image:
         return quantised(READ_NOISE * moment.noise(pair, side).standard_normal(image.shape, dtype=np.float32) + 1.0)
@@ -26,7 +26,7 @@ def no_pair(moment: Moment) -> Images:
 
 
 def nothing(moment: Moment) -> Images:
-    """All cables pulled: the framesets stay away."""
+    """All cables pulled: no frameset arrives."""
     return {}
 
 
@@ -41,7 +41,7 @@ def all_swapped(moment: Moment) -> Images:
 
 
 def pairs_exchanged(moment: Moment) -> Images:
-    """The cables of all pairs plugged in turn into the next pair's sockets."""
+    """The cables of each pair are plugged into the sockets of the next pair."""
     pairs = moment.all_pairs()
     return {pair: moment.images[pairs[(k + 1) % len(pairs)]] for k, pair in enumerate(pairs)}
 
@@ -70,12 +70,12 @@ def late_camera(moment: Moment) -> Images:
 
 
 def late_pair(moment: Moment) -> Images:
-    """One pair is late by two framesets and is stamped as if it were not."""
+    """One pair is late by two framesets, but has the stamps of the current ones."""
     return _with_pairs(moment, moment.one_pair(), lambda pair: moment.before[-2][pair])
 
 
 def torn(moment: Moment) -> Images:
-    """Every other image is torn: below a row of its own, it still shows the frameset before."""
+    """Every other image is torn: below a row that differs from image to image, it still shows the previous frameset."""
 
     def change(pair: int, side: int, image: Image) -> Image:
         draw = moment.noise(pair, side)

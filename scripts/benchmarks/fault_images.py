@@ -16,11 +16,11 @@ from graphvio.arrays import AnyArray, Float, Image
 from graphvio.rig import Rig
 
 Images = Mapping[int, tuple[Image, Image]]
-"""Pair index -> (left, right), each (height, width) uint8."""
+"""Pair index -> left and right image, each (height, width) uint8."""
 
-_SHOT_VARIANCE = 0.02  # of the simulator's film: grey levels squared for every grey level of light
-READ_NOISE = 0.7  # grey levels at gain 1
-_SUDDEN_S = 0.3  # for how long an exposure lasts that jumps
+_SHOT_VARIANCE = 0.02  # shot noise of the simulator's film: grey levels squared for every grey level of light
+READ_NOISE = 0.7  # standard deviation, grey levels at gain 1
+_SUDDEN_S = 0.3  # time between jumps of the exposure
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +28,15 @@ class Moment:
     """A frameset that a fault alters.
 
     Attributes:
-        images: as they would be without the fault.
-        before: the same of the framesets before, the newest last; longer than any fault lasts.
-        rig: that the images are of.
+        images: images without the fault.
+        before: images of the previous framesets without the fault, the newest last, for longer than any fault lasts.
+        rig: rig of the recording.
         world_T_body: (4, 4) the true pose.
-        world_T_body_then: (4, 4) the same when the fault began.
-        velocity_then: (3,) m/s in world, when the fault began.
-        number: framesets since the fault began, 0 for the first.
-        period_s: between framesets.
-        seed: of the fault: equal for all its moments.
+        world_T_body_then: (4, 4) the true pose when the fault began.
+        velocity_then: (3,) m/s in world, the true velocity when the fault began.
+        number: number of framesets since the fault began, 0 for the first.
+        period_s: time between framesets.
+        seed: seed of the fault, the same for all its moments.
     """
 
     images: Images
@@ -56,27 +56,27 @@ class Moment:
 
     @property
     def frozen(self) -> Images:
-        """The images before the fault began."""
+        """The last images before the fault began."""
         return self.before[-1 - self.number]
 
     def fixed(self, *key: int) -> np.random.Generator:
-        """Random numbers that are the same at all moments of a fault."""
+        """Return a generator of random numbers that are the same at all moments of a fault."""
         return np.random.default_rng([*self.seed, 1, *key])
 
     def noise(self, *key: int) -> np.random.Generator:
-        """Random numbers of this moment alone."""
+        """Return a generator of random numbers for this moment only."""
         return np.random.default_rng([*self.seed, 2, self.number, *key])
 
     def one_pair(self) -> list[int]:
-        """One pair, chosen at random for the length of the fault."""
+        """Return the index of one pair, chosen at random for the whole fault, in a list."""
         return [int(self.fixed(0).choice(sorted(self.images)))]
 
     def all_pairs(self) -> list[int]:
-        """All pairs."""
+        """Return the indices of all pairs."""
         return sorted(self.images)
 
     def altered(self, pairs: Sequence[int], change: Callable[[int, int, Image], Image]) -> Images:
-        """The images with ``change(pair, side, image)`` applied to both sides of some pairs."""
+        """Return the images, with ``change(pair, side, image)`` applied to both images of the given pairs."""
         changed = dict(self.images)
         for pair in pairs:
             left, right = self.images[pair]
@@ -88,12 +88,12 @@ Fault = Callable[[Moment], Images]
 
 
 def quantised(values: AnyArray) -> Image:
-    """Grey values as 8 bit, saturated."""
+    """Return grey values as 8 bit, saturated."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def darkness(moment: Moment) -> Images:
-    """Lamps that fail: 0.5 to 4 % of the light; the gain makes up for half of it, and amplifies the noise."""
+    """Failing lamps: 0.5 to 4 % of the light; the gain compensates for half of the loss, and amplifies the noise."""
     light = float(np.exp(moment.fixed().uniform(np.log(0.005), np.log(0.04))))
     gain = light**-0.5
 
@@ -112,7 +112,7 @@ def over_exposure(moment: Moment) -> Images:
 
 
 def exposure_jumps(moment: Moment) -> Images:
-    """Every 0.3 s another exposure, and another one in each camera: from a quarter to three times as bright."""
+    """An exposure that changes every 0.3 s, in each camera differently: from a quarter to three times as bright."""
     step = int(moment.since_s / _SUDDEN_S)
 
     def change(pair: int, side: int, image: Image) -> Image:
@@ -136,7 +136,7 @@ def motion_blur(moment: Moment) -> Images:
 
 
 def salt_and_pepper(moment: Moment) -> Images:
-    """Between 2 and 25 % of the pixels black or white, others in every image."""
+    """Between 2 and 25 % of the pixels black or white, different ones in every image."""
     share = float(moment.fixed().uniform(0.02, 0.25))
 
     def change(pair: int, side: int, image: Image) -> Image:
@@ -176,9 +176,9 @@ def dirty_lenses(moment: Moment) -> Images:
 
 
 def glass(moment: Moment) -> Images:
-    """A glass pane before one pair: a third to two thirds of what is seen is the mirror image of another moment.
+    """A glass pane in front of one pair: a third to two thirds of the light is the mirror image of another moment.
 
-    The sides are exchanged with the mirroring, so that the reflection has the disparities of a mirror world.
+    Left and right are exchanged with the mirroring, so that the reflection has the disparities of a mirrored world.
     """
     share = float(moment.fixed(1).uniform(0.35, 0.65))
     other = moment.before[-20]
@@ -190,7 +190,7 @@ def glass(moment: Moment) -> Images:
 
 
 def water(moment: Moment) -> Images:
-    """Water in the lower half of all views: the upper half upside down, in waves that travel."""
+    """Water in the lower half of all images: it reflects the upper half upside down, in travelling waves."""
     draw = moment.fixed()
     speed, length = float(draw.uniform(4.0, 10.0)), float(draw.uniform(30.0, 70.0))
 
@@ -207,7 +207,7 @@ def water(moment: Moment) -> Images:
 
 
 def _image_motion(moment: Moment, pair: int) -> float:
-    """Direction in radians of the motion of a pair's left image since the one before."""
+    """Return the direction, radians, in which a pair's left image has moved since the previous frameset."""
     small = [
         cv2.resize(images[pair][0], (160, 120), interpolation=cv2.INTER_AREA).astype(np.float32)
         for images in (moment.before[-1], moment.images)
@@ -217,7 +217,7 @@ def _image_motion(moment: Moment, pair: int) -> float:
 
 
 def _line_kernel(length: float, direction: float) -> Float:
-    """Weights (n, n) of a line through the middle, in pixels."""
+    """Return a kernel (n, n) whose weights are a line through the middle, with the given length in pixels."""
     side = 2 * int(np.ceil(0.5 * length)) + 1
     kernel = np.zeros((side, side))
     along = np.linspace(-0.5, 0.5, 8 * side) * length

@@ -1,4 +1,4 @@
-"""Runs the odometry on a hard case and compares every motion of its front-end with the truth."""
+"""Runs of the odometry on hard cases, in which every motion of its front-end is compared with the truth."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class MotionOutcome:
     """One motion that the front-end returned, or that the odometry used.
 
     Attributes:
-        since_s: since the first frameset.
+        since_s: time of its end since the first frameset.
         during: whether it ends while the fault lasts.
-        quality: as the front-end says.
+        quality: quality that the front-end reports.
         nees: squared Mahalanobis distance from the truth, 6 degrees of freedom.
-        error_m: of the translation.
-        error_deg: of the rotation.
-        interval_s: from its reference to its end.
-        inliers: of each pair.
-        points: of each pair, candidates of the estimation.
+        error_m: error of the translation.
+        error_deg: error of the rotation.
+        interval_s: time from its reference to its end.
+        inliers: number of inliers of each pair.
+        points: number of candidate points of each pair in the estimation.
     """
 
     since_s: float
@@ -45,12 +45,12 @@ class MotionOutcome:
 
     @property
     def wrong(self) -> bool:
-        """Beyond 5 sigma."""
+        """Whether the error is beyond 5 sigma."""
         return not self.nees <= BREAK_STATISTIC
 
     @property
     def materially_wrong(self) -> bool:
-        """Beyond 5 sigma, and by more than 1 cm or 0.2 degrees."""
+        """Whether the error is beyond 5 sigma, and larger than 1 cm or 0.2 degrees."""
         return self.wrong and (self.error_m > MATERIAL_M or self.error_deg > MATERIAL_DEG)
 
 
@@ -59,12 +59,12 @@ class Outcome:
     """Result of one run.
 
     Attributes:
-        framesets: that the front-end was given.
-        during: those of them in a fault's interval.
+        framesets: number of framesets that the front-end has processed.
+        during: number of framesets in a fault's interval.
         failures: reason -> number of framesets without a motion.
-        events: kind -> number.
-        motions: all that were returned.
-        used: those that went into the estimate; where pairs contradict each other, that of one consensus set.
+        events: kind -> number of events.
+        motions: all motions that the front-end returned.
+        used: the motions that went into the estimate; where pairs contradict each other, that of one consensus set.
     """
 
     framesets: int = 0
@@ -75,7 +75,7 @@ class Outcome:
     used: list[MotionOutcome] = field(default_factory=list)
 
     def add(self, other: Outcome) -> None:
-        """Count another run in."""
+        """Add the counts and motions of another run."""
         self.framesets += other.framesets
         self.during += other.during
         self.failures.update(other.failures)
@@ -85,12 +85,12 @@ class Outcome:
 
 
 class Run:
-    """An odometry whose motions are logged; with the rig's IMU, or on vision alone.
+    """An odometry whose motions are logged, with the rig's IMU or with vision alone.
 
     Args:
-        rig: of the recording.
-        config: of the odometry.
-        with_imu: whether the IMU takes part.
+        rig: rig of the recording.
+        config: configuration of the odometry.
+        with_imu: whether the IMU is used.
     """
 
     def __init__(self, rig: Rig, config: Config, *, with_imu: bool) -> None:
@@ -100,7 +100,7 @@ class Run:
         self._during: dict[int, bool] = {}
 
     def feed(self, measurement: Measurement, during: bool) -> None:
-        """Process a measurement, given whether a fault is active."""
+        """Process a measurement; ``during`` says whether a fault is active."""
         if isinstance(measurement, FrameSet):
             self._during[measurement.stamp_ns] = during
         elif not self._with_imu:
@@ -108,7 +108,7 @@ class Run:
         self._odometry.process(measurement)
 
     def finish(self, truth: dict[int, Float], start_ns: int) -> Outcome:
-        """End the run and compare it with the truth, stamp -> ``world_T_body`` (4, 4)."""
+        """End the run, and compare its motions with the truth, stamp -> ``world_T_body`` (4, 4)."""
         self._odometry.finish()
         results, used = self._vision_log
         outcome = Outcome(len(results), sum(self._during.values()))

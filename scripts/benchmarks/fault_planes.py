@@ -1,7 +1,7 @@
-"""Objects that move in front of the cameras: a door that fills a view, people who cross, a crowd that walks as one.
+"""Objects that move in front of the cameras: a door that fills a view, people who cross it, a crowd that walks as one.
 
-Each is a textured plane in the world. It is rendered into both images of a pair with the pair's camera models, so that
-its disparities, its motion and its lens distortion are those of a real object.
+Each object is a textured plane in the world. It is rendered into both images of a pair with the pair's camera models,
+so that its disparities, its motion and its lens distortion are those of a real object.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphvio.rig import Camera
 
 _WHITE = 230.0  # grey levels of full reflectance
 _PERSON_M = (0.55, 1.75)
-_MARGIN_PX = 12  # by which distortion may bend an edge outwards
+_MARGIN_PX = 12  # distance by which distortion may bend an edge outwards
 _DOORS = ("door", "brick", "poster1", "wood", "books")
 _SHIRTS = ("stripes", "fabric", "poster2", "notices", "books", "poster0")
 
@@ -32,11 +32,11 @@ class Plane:
     """A textured rectangle.
 
     Attributes:
-        world_T_plane: (4, 4): x to the right, y down, z away from the viewer.
-        half_m: half its width and height, metres; infinite for one without an edge.
-        texture: of the simulator's textures.
-        tile_m: metres that the texture covers.
-        shift: of the texture, repetitions.
+        world_T_plane: (4, 4) its pose: x to the right, y down, z away from the viewer.
+        half_m: half its width and height, metres; infinite for a plane without edges.
+        texture: name of one of the simulator's textures.
+        tile_m: size of one repetition of the texture, metres.
+        shift: shift of the texture, in repetitions.
     """
 
     world_T_plane: Float
@@ -47,7 +47,7 @@ class Plane:
 
 
 def door_in_one_view(moment: Moment) -> Images:
-    """A door, near and textured, that fills one pair's view and moves by itself: 0.05 to 0.8 m/s, and turns."""
+    """A near, textured door that fills one pair's view and moves by itself, at 0.05 to 0.8 m/s, and turns."""
     draw, pair = moment.fixed(3), moment.one_pair()[0]
     velocity = _direction(draw) * float(np.exp(draw.uniform(np.log(0.05), np.log(0.8))))
     turning = so3_exp(np.array([0.0, draw.uniform(-0.4, 0.4) * moment.since_s, 0.0]))
@@ -73,7 +73,7 @@ def people_all_around(moment: Moment) -> Images:
 
 
 def crowd_as_one(moment: Moment) -> Images:
-    """Twelve people before every pair who all walk with one velocity, as a marching column does."""
+    """Twelve people in front of every pair, who all walk with the same velocity, like a marching column."""
     images = moment.images
     for pair in moment.all_pairs():
         images = {**images, **_only(draw_planes(moment, [pair], _people(moment, pair, together=True)), pair)}
@@ -81,7 +81,7 @@ def crowd_as_one(moment: Moment) -> Images:
 
 
 def draw_planes(moment: Moment, pairs: Sequence[int], planes: Sequence[Plane]) -> Images:
-    """The images of a moment with planes rendered over both sides of some pairs, the nearest in front."""
+    """Return the images of a moment with planes rendered over both images of some pairs, nearer ones in front."""
 
     def change(pair: int, side: int, image: Image) -> Image:
         camera = moment.rig.pairs[pair].right if side else moment.rig.pairs[pair].left
@@ -119,9 +119,9 @@ def _people(moment: Moment, pair: int, *, together: bool) -> list[Plane]:
 
 
 def _carried(moment: Moment, pair: int, left_T_plane: Float, own_velocity: Float) -> Float:
-    """``world_T_plane`` of an object that moves with the rig and has a velocity (3,) relative to it, m/s.
+    """Return ``world_T_plane`` (4, 4) of an object that moves with the velocity that the rig had when the fault began.
 
-    The own velocity is in frame body as it was when the fault began.
+    ``own_velocity`` (3,) m/s, relative to the rig, is added to it, in the frame body when the fault began.
     """
     pose = moment.world_T_body_then @ moment.rig.pairs[pair].left.body_T_cam @ left_T_plane
     own = moment.world_T_body_then[:3, :3] @ own_velocity
@@ -130,7 +130,7 @@ def _carried(moment: Moment, pair: int, left_T_plane: Float, own_velocity: Float
 
 
 def _draw(image: AnyArray, depth: AnyArray, camera: Camera, cam_T_plane: Float, plane: Plane) -> None:
-    """Draw a plane into an image (H, W) where it is nearer than the depth (H, W), both float32, in place."""
+    """Draw a plane into an image (H, W) in place where it is nearer than the depth (H, W); both are float32."""
     window = _window(camera, cam_T_plane, plane)
     rays, known = (values[window] for values in _rays(camera))
     if not known.any():
@@ -156,7 +156,7 @@ def _draw(image: AnyArray, depth: AnyArray, camera: Camera, cam_T_plane: Float, 
 
 
 def _window(camera: Camera, cam_T_plane: Float, plane: Plane) -> tuple[slice, slice]:
-    """Rows and columns that hold all of a plane's image; all of them where its corners are not in sight."""
+    """Return the rows and columns that contain a plane's image; all of them if its corners are not in view."""
     if not np.isfinite(plane.half_m[0]):
         return slice(None), slice(None)
     corners = np.array([[x, y, 0.0, 1.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)]) * [*plane.half_m, 0.0, 1.0]
@@ -171,7 +171,7 @@ def _window(camera: Camera, cam_T_plane: Float, plane: Plane) -> tuple[slice, sl
 
 @cache
 def _rays(camera: Camera) -> tuple[AnyArray, Bool]:
-    """Directions ``[x, y, 1]`` (H, W, 3) float32 of a camera's pixels, and whether each has one (H, W)."""
+    """Return the directions ``[x, y, 1]`` (H, W, 3) float32 of a camera's pixels, and whether each has one (H, W)."""
     width, height = camera.size_px
     y, x = np.mgrid[0:height, 0:width]
     rays, known = camera.unproject(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
@@ -180,7 +180,7 @@ def _rays(camera: Camera) -> tuple[AnyArray, Bool]:
 
 
 def _texture(name: str, pixels: float) -> AnyArray:
-    """A texture at no more texels than the pixels that it covers, so that it does not alias."""
+    """Return a texture with no more texels than the pixels that it covers, to avoid aliasing."""
     return _level(name, max(round(np.log2(512.0 / max(pixels, 8.0))), 0))
 
 

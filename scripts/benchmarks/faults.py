@@ -1,7 +1,7 @@
-"""``scripts/benchmark faults``: does the front-end ever return a confident wrong motion?
+"""``scripts/benchmark faults``: how often the front-end returns a wrong motion with a small covariance.
 
-The odometry runs on hard scenes and on faults of cameras, light and cables, with vision alone and with the IMU, and
-every motion that the front-end returns is compared with the truth.
+The odometry runs on hard scenes and on simulated faults of cameras, light and cables, with vision alone and with the
+IMU. Every motion that the front-end returns is compared with the truth.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Task:
-    """One run: a case by its name, seed, seconds of recording, folder of renders, pairs to use, configuration."""
+    """One run: name of the case, seed, duration, folder of rendered recordings, pairs to use, and configuration."""
 
     case: str
     seed: int
@@ -71,7 +71,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def main(args: argparse.Namespace) -> None:
-    """Run the campaign and report."""
+    """Run all cases and report."""
     if args.seeds < 1 or args.duration <= 0.0 or args.jobs < 1:
         raise GraphvioError("--seeds, --duration and --jobs must be positive")
     names = args.cases or [case.name for case in CASES]
@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> None:
     config = Config.load(args.config) if args.config else Config()
     tasks = [Task(name, seed, args.duration, args.data, pairs, config) for name in names for seed in range(args.seeds)]
     for task in tasks:
-        _folder(task)  # before processes would render the same scene twice
+        _folder(task)  # rendered here, since several processes would render the same scene twice
     outcomes: dict[str, dict[bool, Outcome]] = {name: {mode: Outcome() for mode in _MODES} for name in names}
     for task, by_mode in zip(tasks, _run_all(tasks, args.jobs), strict=True):
         for mode, outcome in by_mode.items():
@@ -94,7 +94,7 @@ def main(args: argparse.Namespace) -> None:
 
 
 def run_case(task: Task) -> dict[bool, Outcome]:
-    """One case, without (False) and with (True) the IMU, on the same images."""
+    """Run a case on the same images without the IMU (key False) and with it (key True)."""
     case, duration_s = _case(task)
     source = open_source(_folder(task))
     if task.pairs is not None:
@@ -118,7 +118,7 @@ def _run_all(tasks: Sequence[Task], jobs: int) -> list[dict[bool, Outcome]]:
             results.append(run_case(task))
             log_progress(_progress(task, results[-1]))
         return results
-    # A fork would copy the locks of the threads that have run before, and wait for them for ever.
+    # A forked process would copy locks that threads hold, and wait for them for ever.
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for task, result in zip(tasks, pool.map(run_case, tasks), strict=True):
             results.append(result)
@@ -127,7 +127,7 @@ def _run_all(tasks: Sequence[Task], jobs: int) -> list[dict[bool, Outcome]]:
 
 
 def _case(task: Task) -> tuple[Case, float]:
-    """The case of a task, and how long its recording is."""
+    """Return the case of a task, and the length of its recording, seconds."""
     case = next(case for case in CASES if case.name == task.case)
     return case, CORRIDOR_S if case.scene == "corridor" else task.duration_s
 
@@ -149,7 +149,7 @@ def _progress(task: Task, by_mode: Mapping[bool, Outcome]) -> str:
 
 
 def _options(args: argparse.Namespace) -> str:
-    """The command line, as far as results depend on it."""
+    """Return the options of the command line on which the results depend."""
     options = [f"`--seeds {args.seeds}`", f"`--duration {args.duration:g}`"]
     if args.cases:
         options.append(f"`--cases {' '.join(args.cases)}`")
@@ -216,7 +216,7 @@ def _mean_inliers(motions: Sequence[MotionOutcome]) -> list[str]:
 
 
 def _shares(total: Outcome) -> list[str]:
-    """One line for each group of motions."""
+    """Return one line for each group of motions, with the shares of wrong ones."""
     groups = {
         "All returned motions": total.motions,
         "of good quality": [m for m in total.motions if m.quality == Quality.GOOD],
@@ -248,7 +248,7 @@ def _aim_result(total: Outcome) -> str:
 
 
 def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> None:
-    """A line for each motion that was returned, and for each that was used."""
+    """Write a file with a line for each motion that was returned, and for each that was used."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)

@@ -1,7 +1,7 @@
-"""Program of ``scripts/benchmark startup``: prints the seconds that each part takes until the first estimate, as JSON.
+"""Program that ``scripts/benchmark startup`` runs: prints as JSON the seconds of each step up to the first estimate.
 
-Usage: ``python -m benchmarks.first_estimate RECORDING PAIRS IMU``, pairs as 0 or 0,1 and IMU as yes or no. It imports
-nothing before the clock runs.
+Usage: ``python -m benchmarks.first_estimate RECORDING PAIRS IMU``, with PAIRS such as 0 or 0,1 and IMU yes or no. All
+imports are within the measured time.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""``scripts/benchmark frontend``: the time of each stage, and that of a plain pipeline of OpenCV's functions."""
+"""``scripts/benchmark frontend``: time of each stage of the front-end, next to a plain pipeline of OpenCV functions."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ from graphvio.runtime import set_up_threads
 from graphvio.warmup import warm_up
 
 AIM = 0.35
-"""The front-end's median over the reference's, for two pairs; of several rounds the median."""
+"""Aim for the front-end's median time over the reference's, for two pairs; of several rounds, the median ratio."""
 AIM_MS = 10.0
-"""Median of the complete odometry, from decoded images to the estimate, for two pairs of `AIM_SIZE_PX` on 2 cores."""
+"""Aim for the median time of the complete odometry, from decoded images to the estimate, for two pairs of `AIM_SIZE_PX`
+on 2 cores."""
 AIM_SIZE_PX = (640, 480)
 BACKEND_STAGES = ("predict", "update")
 _SHORTEST_S = 12
@@ -74,7 +75,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the times and report them next to the aims."""
     if min(args.framesets, args.growth_framesets) < _MIN_FRAMESETS or args.rounds < 1:
         raise GraphvioError(f"percentiles need framesets: give {_MIN_FRAMESETS} or more, and at least one round")
     set_up_threads()  # as commands do; each contender then sets its number of OpenCV's threads
@@ -103,10 +104,14 @@ class _Round(NamedTuple):
     """Result of one round.
 
     Attributes:
-        whole, ours, theirs: times of the odometry, of the front-end alone and of the reference.
-        tracks, points: mean numbers of the front-end for each pair.
-        failures: framesets in which it found no motion.
-        candidates, inliers: mean number of points of the reference for each pair, and the share of inliers.
+        whole: times of the complete odometry.
+        ours: times of the front-end alone.
+        theirs: times of the reference.
+        tracks: mean number of the front-end's tracks for each pair.
+        points: mean number of the front-end's candidate points for each pair.
+        failures: number of framesets in which the front-end found no motion.
+        candidates: mean number of the reference's candidate points for each pair.
+        inliers: share of the inliers among them.
     """
 
     whole: Timings
@@ -142,7 +147,7 @@ def _round(folder: Path, count: int, profile: str) -> _Round:
 def _stages(report: Report, footage: Footage, folder: Path, args: argparse.Namespace, title: str) -> None:
     whole, ours, theirs = Timings(), Timings(), Timings()
     rounds: list[_Round] = []
-    # Each in a process of its own: how fast OpenCV's threads are depends on the process as much as on the moment.
+    # Each round has its own process: the speed of OpenCV's threads differs between processes as much as over time.
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         for number in range(args.rounds):
             log_progress(f"timing odometry, front-end and reference in turns, round {number + 1} of {args.rounds}")
@@ -198,7 +203,7 @@ def _aims(report: Report, rig: Rig, ratios: Sequence[float], odometry: Timings, 
 
 
 def _rows(name: str, timings: Timings) -> list[list[str]]:
-    """A row for each stage, in order of appearance, and one for the total; stages may run side by side."""
+    """Return a row for each stage, in order of appearance, and one for the total; stages may run in parallel."""
     stages = {**timings.stage_ms, "**total**": timings.total_ms}
     return [
         [

@@ -1,4 +1,4 @@
-"""How the front-end's time grows: with features, hypotheses, pairs and pixels, each next to the reference pipeline."""
+"""Growth of the front-end's time with features, hypotheses, pairs and pixels, next to that of the reference."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _HEAD = ("tracks a pair", "points a pair", "median, ms", "p95, ms", "reference, 
 
 
 def add_growth(report: Report, footage: Footage, config: Config, framesets: int) -> None:
-    """Measure all four tables.
+    """Measure and add all four tables.
 
     Args:
-        report: takes them.
-        footage: of the recording.
-        config: of the front-end, varied in one value at a time.
-        framesets: counted for each row.
+        report: report to which the tables are added.
+        footage: the recording.
+        config: configuration of the front-end; one value at a time is varied.
+        framesets: number of framesets that are counted for each row.
     """
     short = footage.first(WARM_UP + framesets)
     report.add(
@@ -92,7 +92,7 @@ def _sizes(report: Report, footage: Footage, config: Config) -> None:
 
 
 def _row(footage: Footage, config: Config, reference: ReferenceContender) -> list[str]:
-    """The cells of `_HEAD`."""
+    """Measure one case, and return the cells below `_HEAD`."""
     warm_up(footage.rig, config)
     frontend = FrontendContender(footage, config)
     ours, theirs = take_turns([frontend, reference], len(footage.steps))
@@ -108,7 +108,7 @@ def _row(footage: Footage, config: Config, reference: ReferenceContender) -> lis
 
 
 def _cells_for(footage: Footage, config: Config, wanted: int) -> int:
-    """The cells across with which about so many tracks a pair are kept: their number goes as its square."""
+    """Find the number of cells across with which a pair has about ``wanted`` tracks, which grow with its square."""
     width, height = footage.rig.pairs[0].left.size_px
     across = round(width / np.sqrt(width * height / wanted))
     tried: dict[int, float] = {}

@@ -1,4 +1,4 @@
-"""``scripts/benchmark lenses``: accuracy by the lens model at the same field of view, rolling shutters, fisheyes."""
+"""``scripts/benchmark lenses``: accuracy of lens models with the same field of view, rolling shutters and fisheyes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from graphvio.sources import open_source
 _SIZE_PX = (320, 240)
 _FIELD_OF_VIEW_DEG = 78.0
 _READOUT_MS = 20.0
-_FAST_RATE_HZ, _FAST_READOUT_MS, _MOVING_S = 30.0, 30.0, 4.0  # the walk turns then
+_FAST_RATE_HZ, _FAST_READOUT_MS, _MOVING_S = 30.0, 30.0, 4.0  # from this time on the walk turns
 _PINHOLE = "pinhole"
 _LENSES: Mapping[str, tuple[str, Sequence[float]]] = {
     _PINHOLE: ("radial-tangential", []),
@@ -38,7 +38,7 @@ _LENSES: Mapping[str, tuple[str, Sequence[float]]] = {
 }
 _FISHEYE = np.array([0.0034, 0.0007, -0.0020, 0.0002])
 _FISHEYES = {"512x512, 154 degrees": ((512, 512), 190.0), "848x800, 170 degrees": ((848, 800), 286.0)}
-"""Name with the angle across -> size, and pixels for a radian: as TUM-VI's cameras, and as a T265's."""
+"""Name, with the angle across the image -> size, and pixels per radian: like the cameras of TUM-VI and of a T265."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -62,7 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_all(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the accuracy of all lenses, and report."""
     if args.seeds < 1:
         raise GraphvioError("--seeds must be at least 1")
     if not args.duration > _MOVING_S + 1.0:
@@ -101,9 +101,9 @@ def run_all(args: argparse.Namespace) -> None:
 
 
 def rig_of(lens: str) -> Rig:
-    """Return the simulator's stereo pair with lenses that reach as far to each side, up and down as the pinhole's.
+    """Return the simulator's stereo pair with other lenses, whose field of view is that of the pinhole cameras.
 
-    Images are as wide; their height follows from the lens.
+    The images have the same width; their height follows from the lens.
     """
     model, coefficients = _LENSES[lens]
     width, height = _SIZE_PX

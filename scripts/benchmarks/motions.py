@@ -1,4 +1,4 @@
-"""The motions that vision measures, logged on their way to the odometry and compared with the truth."""
+"""Log of the motions that vision measures, and their comparison with the truth."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ from graphvio.odometry import Odometry
 
 BREAK_SIGMA = 5.0
 BREAK_STATISTIC = float(chi2.isf(2.0 * norm.sf(BREAK_SIGMA), 6))
-"""Squared Mahalanobis distance that 6 degrees of freedom exceed as rarely as one exceeds 5 sigma: 5.7e-7."""
+"""Squared Mahalanobis distance with 6 degrees of freedom that is exceeded with the probability of 5 sigma in one
+dimension, 5.7e-7."""
 
 
 class TruthNoise(NamedTuple):
     """Standard deviations of true poses.
 
     Attributes:
-        angle_rad: standard deviation of their orientations, about each axis.
-        position_m: of their positions, along each axis.
+        angle_rad: standard deviation of the orientation, about each axis.
+        position_m: standard deviation of the position, along each axis.
     """
 
     angle_rad: float = 0.0
@@ -41,9 +42,9 @@ class MotionError(NamedTuple):
     """Error of a motion.
 
     Attributes:
-        statistic: squared Mahalanobis distance by the motion's own covariance, 6 degrees of freedom.
-        error_m: of the translation.
-        error_deg: of the rotation.
+        statistic: squared Mahalanobis distance of the error by the motion's covariance, 6 degrees of freedom.
+        error_m: error of the translation.
+        error_deg: error of the rotation.
     """
 
     statistic: float
@@ -64,10 +65,10 @@ class VisionLog(NamedTuple):
 
 
 def log_vision(odometry: Odometry) -> VisionLog:
-    """Log the front-end's results while an odometry runs.
+    """Return a log that the front-end's results enter while the odometry runs.
 
-    An estimate carries only the pose, in which IMU and earlier motions hide an error of the motion that vision
-    measured; so the results are logged on their way from the front-end to the estimator.
+    Results are logged between front-end and estimator: an estimate has only the pose, in which IMU and earlier motions
+    hide errors of the motion that vision measured.
     """
     process, apply = odometry._frontend.process, odometry._estimator.apply
     vision_log = VisionLog({}, {})
@@ -102,17 +103,17 @@ def motion_error(
 ) -> MotionError:
     """Compare a motion with the truth.
 
-    The error is the tangent ``log(true^-1 measured)``, in the body frame of the later instant as the covariance is.
+    The error is the tangent ``log(true^-1 measured)`` in the body frame of the later instant, like the covariance.
 
     Args:
-        motion: measured.
+        motion: the measured motion.
         world_T_reference: (4, 4) true pose of body at the motion's earlier instant.
-        world_T_current: (4, 4) the same at the later one.
-        noise: of the two true poses.
+        world_T_current: (4, 4) true pose of body at the later instant.
+        noise: noise of each of the two true poses.
     """
     true_motion = se3_inverse(world_T_reference) @ world_T_current
     error = se3_log(se3_inverse(true_motion) @ motion.reference_T_current)
-    of_truth = np.diag(np.repeat(2.0 * np.square(noise), 3))  # of the difference of two poses, in any frame
+    of_truth = np.diag(np.repeat(2.0 * np.square(noise), 3))  # covariance of the difference of two poses, in any frame
     try:
         statistic = float(error @ np.linalg.solve(motion.covariance + of_truth, error))
     except np.linalg.LinAlgError:

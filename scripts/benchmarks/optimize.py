@@ -1,7 +1,7 @@
 """``scripts/benchmark optimize``: optimisation of whole sessions.
 
-Synthetic sessions without images show how time and memory grow with the length, and the effect of false loop closures.
-Recordings show the gain in accuracy, which pairs close loops, and how well places are recognised.
+Synthetic sessions without images show how time and memory grow with the length of a session, and the effect of false
+loop closures. Recordings show the gain in accuracy, which pairs close loops, and how well places are recognised.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def main(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure all parts, and report."""
     if args.seeds < 1 or args.jobs < 1 or min(args.minutes) <= 3.0:
         raise GraphvioError("--seeds and --jobs must be positive, and --minutes more than 3: loops close between laps")
     for part, measure in ((HOUR, _hour), (FALSE, _false), (RECORDED, _recorded)):
@@ -91,7 +91,7 @@ def _recorded(report: Report, args: argparse.Namespace) -> None:
 
 
 def _by_pairs(recording: Path, both: Optimized, space: Path) -> dict[str, Optimized]:
-    """Optimise with each pair alone, and add the run with all of them."""
+    """Optimise with each pair alone; return these runs and the given one with all pairs, by the pairs' names."""
     pairs = open_source(recording).rig.pairs
     log_progress(f"the {AIMED_AT} with each pair alone")
     runs = {

@@ -1,4 +1,4 @@
-"""Accuracy and time by stage of optimised recordings."""
+"""Accuracy of optimised recordings, and the time of each stage."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Optimized:
     """A recording that was optimised.
 
     Attributes:
-        folder: of the results, with the database of its features.
+        folder: folder of the results, with the database of features.
         session: the recording.
-        truth: of it.
-        found: the optimisation.
-        stage_s: seconds by stage.
+        truth: true trajectory of the recording.
+        found: result of the optimisation.
+        stage_s: name of the stage -> time in seconds.
     """
 
     folder: Path
@@ -52,12 +52,12 @@ class Optimized:
 
     @property
     def used(self) -> Bool:
-        """Which closures (L,) are used."""
+        """Whether each loop closure (L,) is used."""
         return np.array([not loop.refusal for loop in self.found.loops], dtype=bool)
 
     @property
     def across(self) -> Bool:
-        """Which closures (L,) are between different pairs."""
+        """Whether each loop closure (L,) is between different pairs."""
         return np.array([any(a != b for a, b in loop.closure.pairs) for loop in self.found.loops], dtype=bool)
 
     def ate_m(self, poses: Float) -> float:
@@ -66,7 +66,7 @@ class Optimized:
         return evaluate(Trajectory(stamps_ns, poses), self.truth).ate_position_m.rmse
 
     def ates_m(self) -> tuple[float, float, float, float]:
-        """Online, smoothed, optimised without loops, and with them."""
+        """Return the ATEs of the online, the smoothed, and the optimised trajectory without and with loop closures."""
         session = self.found.sessions[0]
         alone = spread(session.nodes, poses_of(self.found.alone, len(session.nodes.rows)))
         poses = (session.record.online, session.record.smoothed, alone, session.nav_T_body)
@@ -74,7 +74,7 @@ class Optimized:
         return online, smoothed, without, with_loops
 
     def closures_off(self) -> Float:
-        """Return the errors of all closures: (L, 2) metres and degrees; NaN where the truth is not known."""
+        """Return the errors of all loop closures, (L, 2) metres and degrees; NaN where the truth is not known."""
         made = np.full((len(self.found.loops), 2), np.nan)
         record = self.found.sessions[0].record
         for number, loop in enumerate(self.found.loops):
@@ -85,7 +85,8 @@ class Optimized:
         return made
 
     def ends_off_m(self, poses: Float) -> Float:
-        """Return the errors of the relative positions of both ends of each used closure, by poses (F, 4, 4)."""
+        """Return, for each used closure with known truth, the error in metres of the position of one end relative to
+        the other, by the poses (F, 4, 4)."""
         made = []
         record = self.found.sessions[0].record
         for loop in (loop for loop in self.found.loops if not loop.refusal):
@@ -108,10 +109,10 @@ def optimized(folder: Path, name: str, out: Path, pairs: tuple[int, ...] | None 
     """Optimise a recording.
 
     Args:
-        folder: of the recording.
-        name: that it has in the results.
+        folder: folder of the recording.
+        name: name of the recording in the results.
         out: folder of the results.
-        pairs: only these; None for all.
+        pairs: indices of the pairs to use; None for all.
 
     Raises:
         GraphvioError: if the recording cannot be read or has no truth.
@@ -134,7 +135,7 @@ def optimized(folder: Path, name: str, out: Path, pairs: tuple[int, ...] | None 
 
     session = Session(source.name, source)
     found = optimize_sessions([source], out, config, on_progress=lambda what, *_: note(_stage(what)))
-    note("map")  # and the report
+    note("map")  # time of the map and of the report
     made = Optimized(out, session, load_trajectory(source.truth), found, spent)
     log_progress(
         f"  {name}: {sum(spent.values()):.0f} s, {int(made.used.sum())} of {len(made.used)} closures used, ATE "
@@ -148,7 +149,7 @@ def _stage(what: str) -> str:
 
 
 def add_recordings(report: Report, runs: dict[str, Optimized]) -> None:
-    """Tables of errors, closures and times."""
+    """Add the tables of errors, closures and times."""
     report.add("### Recordings", f"All pairs and the IMU; ATE in cm. {_lengths(runs)}")
     rows = []
     for name, run in runs.items():
@@ -205,7 +206,7 @@ def add_recordings(report: Report, runs: dict[str, Optimized]) -> None:
 
 
 def add_pairs(report: Report, runs: dict[str, Optimized]) -> None:
-    """Table of one recording by its pairs; ``runs`` has their names."""
+    """Add the table of one recording by the pairs that are used; ``runs`` is name of the pairs -> run."""
     report.add(
         "### Pairs of the loop",
         "The loop with each pair alone and with both. *Across pairs* are closures by points of one pair which the "

@@ -1,4 +1,4 @@
-"""Retrieval: how often images that show the same are among those that look most alike."""
+"""Benchmark of image retrieval: how often images of the same view are among those that look most alike."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class _Views(NamedTuple):
     """The left images of a recording's places.
 
     Attributes:
-        names: of N images.
-        descriptors: of each, (K, 128).
-        is_allowed: (N, N) whether one may be asked for by another: apart in time.
-        shows_the_same: (N, N) whether it ought to be found.
+        names: names of the N images.
+        descriptors: descriptors of each image, (K, 128).
+        is_allowed: (N, N) whether a query by the row's image may return the column's: whether they are apart in time.
+        shows_the_same: (N, N) whether both show the same, so that the query should return it.
     """
 
     names: list[str]
@@ -97,10 +97,10 @@ def _by_vlad(views: _Views, words: int, seed: int) -> Float:
 
 
 def _by_tree(run: Optimized, views: _Views) -> tuple[Float, float]:
-    """Similarity (N, N) by COLMAP's index, and the seconds that it takes.
+    """Return the similarity (N, N) by COLMAP's index, and the time for computing it, seconds.
 
-    ``VisualIndex.query`` fills a list that Python does not get back, so COLMAP's own choice of pairs is asked, which
-    takes its images from a database: one of the left images alone.
+    ``VisualIndex.query`` cannot return its results to Python, so COLMAP's generator of image pairs is used. It takes
+    the images from a database, so a database with only the left images is made.
     """
     library = colmap()
     with tempfile.TemporaryDirectory() as folder, FeatureDatabase(Path(folder) / "left.db") as left:

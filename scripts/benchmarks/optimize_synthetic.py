@@ -1,4 +1,4 @@
-"""Synthetic sessions without images: time and memory by length, and accuracy by the share of false closures."""
+"""Optimisation of synthetic sessions without images: time and memory by length, accuracy by share of false closures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LOOPS_AN_HOUR, FALSE_SHARE = 200, 0.3
 _BLOCK = 15  # variables of a state: pose, velocity, biases
 _WALK_S, _RIGHT = 315.0, 42
 _FALSE = (0, 5, 18, 42, 63)
-"""With the true ones, these are 0, 10, 30, 50 and 60 % of all closures."""
+"""Numbers of false closures; together with the true ones, they are 0, 10, 30, 50 and 60 % of all closures."""
 _AIMED_AT = 18
 _ANYWHERE = 0.0
 _SHIFTS_M = (_ANYWHERE, 2.0, 0.1)
@@ -52,12 +52,12 @@ class _Hour(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Time of the processor, to that of the reference."""
+        """Processor time over that of the reference."""
         return self.processor_s / self.reference_s
 
 
 def add_hour(report: Report, minutes: Sequence[float]) -> None:
-    """Measure sessions of so many minutes."""
+    """Measure sessions of the given lengths, and add the tables."""
     runs = []
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         for length in sorted(minutes):
@@ -101,7 +101,7 @@ def _hour(minutes: float) -> _Hour:
     imu = Imu()
     session = make_session(60.0 * minutes, 1, imu, round(LOOPS_AN_HOUR * minutes / 60.0), FALSE_SHARE)
     warm = make_session(5.0, 1, imu, 0)
-    optimize([warm.record], [imu], [], Config())  # compiles and imports
+    optimize([warm.record], [imu], [], Config())  # so that compilation and imports are not timed
     states = round(5.0 * 60.0 * minutes)
     reference_s = _reference_s(states)
     start, start_processor = perf_counter(), process_time()
@@ -126,7 +126,7 @@ def _hour(minutes: float) -> _Hour:
 
 
 def _reference_s(states: int) -> float:
-    """Processor time of a chain of so many states, factored forwards and solved backwards block by block."""
+    """Return the processor time for a chain of states, factored forwards and solved backwards block by block."""
     rng = np.random.default_rng(0)
     coupling = 0.2 * rng.standard_normal((_BLOCK, _BLOCK))
     own = 10.0 * np.eye(_BLOCK) + coupling @ coupling.T
@@ -161,7 +161,7 @@ class _Result(NamedTuple):
 
 
 def add_false_closures(report: Report, seeds: int, jobs: int) -> None:
-    """Measure what false closures do to a walk."""
+    """Measure the effect of false closures on a walk, and add the table."""
     clean = [_Case(seed, _ANYWHERE, 0) for seed in range(1, seeds + 1)]
     cases = clean + [_Case(seed, *kind) for kind in product(_SHIFTS_M, _FALSE[1:]) for seed in range(1, seeds + 1)]
     results = {}
@@ -215,7 +215,7 @@ def _judged(case: _Case) -> _Result:
 
 
 def _all_alike(session: SyntheticSession, shift_m: float, false: int) -> SyntheticSession:
-    """The same with its last closures off by so many metres along the way."""
+    """Return the session with its last ``false`` closures off by ``shift_m`` metres along the way."""
     shift = np.eye(4)
     shift[0, 3] = shift_m
 
@@ -228,7 +228,7 @@ def _all_alike(session: SyntheticSession, shift_m: float, false: int) -> Synthet
 
 
 def _used(session: SyntheticSession, found: Optimization) -> tuple[int, int]:
-    """Return the numbers of right and of false closures that are used."""
+    """Return the numbers of used closures that are right and that are false."""
     used = [not loop.refusal for loop in found.loops]
     right = len(used) - session.false
     return sum(used[:right]), sum(used[right:])
@@ -247,7 +247,7 @@ def _aim_result(value: float, most: float) -> str:
 
 
 def _peak_mb() -> float:
-    """The most memory that this process has held."""
+    """Return the peak memory of this process, MB."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

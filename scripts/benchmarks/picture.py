@@ -1,4 +1,4 @@
-"""The plot of the accuracy benchmark: trajectories by all pairs and by each alone, seen from above."""
+"""The plot of the accuracy benchmark: trajectories with all pairs and with each alone, seen from above."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _LEFT_IN, _RIGHT_IN, _TITLE_IN, _BOTTOM_IN, _LEGEND_IN = 0.8, 0.25, 0.75, 0.55, 
 
 @dataclass(frozen=True)
 class Panel:
-    """One recording.
+    """Panel of one recording.
 
     Attributes:
-        title: of the panel.
-        lines: name -> run, the one with all pairs first.
+        title: title of the panel.
+        lines: name of the pairs -> run, the one with all pairs first.
     """
 
     title: str
@@ -38,7 +38,7 @@ class Panel:
 
 
 def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
-    """Draw x-y plans below each other, each epoch aligned with the truth at its first pose.
+    """Draw x-y plots of all panels below each other, with the first pose of each epoch aligned with the truth.
 
     Raises:
         GraphvioError: if the picture cannot be written.
@@ -64,7 +64,7 @@ def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
 
 
 class _Plan:
-    """The lines of one panel, turned so that the walk's longer side is horizontal, and the height that they need."""
+    """The lines of one panel, rotated so that the walk's longer side is horizontal, and the height that they need."""
 
     def __init__(self, panel: Panel) -> None:
         self._title = panel.title
@@ -90,11 +90,11 @@ class _Plan:
         self.height_in = float(np.clip(wanted_in, _MIN_HEIGHT_IN, _MAX_HEIGHT_IN))
 
     def _oriented(self, points: Float) -> Float:
-        """Points (N, 2), a quarter turn clockwise where that lays the walk down: (x, y) becomes (y, -x)."""
+        """Return points (N, 2), turned clockwise by 90 degrees, (x, y) to (y, -x), if that lays the walk down."""
         return np.column_stack([points[:, 1], -points[:, 0]]) if self._turned else points
 
     def draw(self, axes: Any) -> None:
-        """Draw onto axes of the wanted height."""
+        """Draw the panel onto axes that have the needed height."""
         truth = self._oriented(self._truth)
         axes.plot(*truth.T, color=_TRUTH, linewidth=2.6, alpha=0.35, label="truth", solid_capstyle="round")
         for i, (name, line) in reversed(list(enumerate(self._lines.items()))):
@@ -130,11 +130,11 @@ class _Plan:
 
 
 def _from_start(outcome: Outcome) -> tuple[Float, float]:
-    """Return the line of a run, the first pose of each epoch aligned with the true one.
+    """Return the line of a run, with the first pose of each epoch aligned with the true one.
 
     Returns:
-        Positions (N, 2) in the truth's frame, NaN between epochs; and how far the last one is from the truth, in
-        space, metres.
+        Positions (N, 2) in the truth's frame, with NaN between epochs; and the distance of the last position from the
+        true one in 3-D, metres.
     """
     plotted, end_m = [], np.nan
     for epoch in np.unique(outcome.epochs):

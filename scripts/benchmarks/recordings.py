@@ -1,4 +1,4 @@
-"""The recordings of the benchmarks: simulated once and kept, and decoded into memory before the clock runs."""
+"""The recordings of the benchmarks: simulated once and stored, and decoded into memory before times are measured."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCENES_OF_TWO_PAIRS = tuple(name for name in SCENE_NAMES if name not in ("street
 
 
 def add_data_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--data DIR``, where simulated recordings are kept."""
+    """Add the option ``--data DIR``, the folder in which simulated recordings are stored."""
     default = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "graphvio" / "benchmarks"
     parser.add_argument(
         "--data",
@@ -39,16 +39,16 @@ def add_data_option(parser: argparse.ArgumentParser) -> None:
 
 
 def simulated(data: Path, scene: str, duration_s: float | None = None, rig_change: str | None = None) -> Path:
-    """The folder of a simulated recording, which is made if it is missing.
+    """Return the folder of a simulated recording, which is rendered if it is missing.
 
     Args:
         data: folder of all recordings.
         scene: one of `graphvio.simulation.SCENE_NAMES`.
-        duration_s: only so much of the walk; None for all of it.
-        rig_change: one of `graphvio.simulation.RIG_CHANGES`; None if the true cameras stay as they are.
+        duration_s: duration of the simulated part of the walk; None for all of it.
+        rig_change: one of `graphvio.simulation.RIG_CHANGES`; None if the true cameras do not change.
 
     Raises:
-        GraphvioError: if it cannot be made.
+        GraphvioError: if the recording cannot be written.
     """
     variant = "whole" if duration_s is None else f"{duration_s:g}s"
     if rig_change is not None:
@@ -61,20 +61,20 @@ def simulated(data: Path, scene: str, duration_s: float | None = None, rig_chang
 
 
 def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path], object], *sources: Path) -> Path:
-    """The folder of a recording, which is rendered if it is missing.
+    """Return the folder of a recording, which is rendered if it is missing.
 
-    Its name ends in a digest of the simulator's sources, so that a changed simulator renders it again; of the scenes'
-    own modules only this scene's counts.
+    The folder's name ends in a digest of the simulator's sources, so that a recording is rendered again after changes
+    of the simulator. Of the modules of scenes, only that of this scene counts.
 
     Args:
         data: folder of all recordings.
-        scene: of the simulator's, or one that the sources hold.
-        variant: distinguishes this recording from all others of the scene.
-        render: writes it into a folder that does not exist yet.
-        sources: more files that decide what is rendered.
+        scene: a scene of the simulator, or one that ``sources`` define.
+        variant: text that distinguishes this recording from all others of the scene.
+        render: function that writes the recording into a folder that does not exist yet.
+        sources: additional source files on which the recording depends.
 
     Raises:
-        GraphvioError: if it cannot be made.
+        GraphvioError: if the recording cannot be written.
     """
     name = f"{scene}-{variant}"
     folder = data / f"{name}-{_digest(scene, sources)}"
@@ -98,12 +98,12 @@ def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path],
 
 @cache
 def _digest(scene: str, sources: tuple[Path, ...]) -> str:
-    """Digest of all sources that determine the bytes of a recording: the simulator, and the modules that it imports."""
+    """Return a digest of all sources that determine a recording's bytes: the simulator, and modules that it imports."""
     package = Path(graphvio.__file__).parent
     taken = ("cameras.py", "geometry.py", "kernels.py", "rig_files/native.py", "sessions/euroc_layout.py")
     scenes = package / "simulation" / "scenes"
     others = {scenes / f"{name}.py" for name in SCENE_NAMES if name != scene}
-    others.add(package / "simulation" / "calibration_error.py")  # of none of these recordings
+    others.add(package / "simulation" / "calibration_error.py")  # none of these recordings depends on it
     simulator = sorted(path for path in (package / "simulation").rglob("*.py") if path not in others)
     digest = hashlib.sha256()
     rig = sorted((package / "rig").glob("*.py"))
@@ -117,8 +117,8 @@ class Footage:
     """A recording in memory.
 
     Attributes:
-        rig: to which the pair indices refer.
-        steps: for each frameset, the measurements since the one before; the frameset is the last of them.
+        rig: rig to which the pair indices refer.
+        steps: for each frameset, the measurements since the previous one; the last of them is the frameset.
     """
 
     rig: Rig
@@ -129,12 +129,12 @@ class Footage:
         """Decode the first framesets of a recording.
 
         Args:
-            folder: of the recording.
-            count: framesets at most.
-            rig: decides on pairs and IMU; None takes the recording's own.
+            folder: folder of the recording.
+            count: maximum number of framesets.
+            rig: rig with the pairs and IMU to use; None for the recording's own.
 
         Raises:
-            GraphvioError: if it cannot be read.
+            GraphvioError: if the recording cannot be read.
         """
         source = open_source(folder, rig)
         steps: list[list[Measurement]] = []
@@ -154,11 +154,11 @@ class Footage:
         return [measurement for step in self.steps for measurement in step if isinstance(measurement, FrameSet)]
 
     def first(self, count: int) -> Footage:
-        """Only the first framesets."""
+        """Return only the first framesets."""
         return Footage(self.rig, self.steps[:count])
 
     def with_pair_count(self, count: int) -> Footage:
-        """A rig of so many pairs, without its IMU: beyond the recording's own pairs, copies of them in turn."""
+        """Return the footage with so many pairs and without the IMU; missing pairs are copies of the recording's."""
         own = len(self.rig.pairs)
         pairs = tuple(_copied(self.rig.pairs[i % own], i // own) for i in range(count))
         framesets = []
@@ -173,7 +173,7 @@ class Footage:
         return Footage(Rig(pairs, name=self.rig.name), [[frameset] for frameset in framesets])
 
     def resized(self, scale: float) -> Footage:
-        """The same in another resolution, without its IMU: images are resampled, intrinsics follow."""
+        """Return the footage in another resolution, without the IMU: images are resampled, intrinsics adapted."""
         pairs = tuple(
             replace(pair, left=_resized(pair.left, scale), right=_resized(pair.right, scale)) for pair in self.rig.pairs
         )
@@ -188,7 +188,7 @@ class Footage:
 
 
 def blocks(measurements: Iterator[Measurement], framesets: int) -> Iterator[list[Measurement]]:
-    """Measurements in lists that hold so many framesets each: reading ahead is done before a list is worked on."""
+    """Yield measurements in lists of so many framesets each; a list is read completely before it is processed."""
     block: list[Measurement] = []
     held = 0
     for measurement in measurements:
@@ -210,7 +210,7 @@ def _copied(pair: StereoPair, copy: int) -> StereoPair:
 
 
 def _resized(camera: Camera, scale: float) -> Camera:
-    """The camera with ``scale`` times as many pixels a side; pixel (0, 0) is the centre of the upper left one."""
+    """Return a camera with ``scale`` times as many pixels a side; pixel (0, 0) is the centre of the upper left one."""
     width, height = (round(scale * size) for size in camera.size_px)
     fx, fy, cx, cy = camera.intrinsics
     intrinsics = np.array([scale * fx, scale * fy, scale * (cx + 0.5) - 0.5, scale * (cy + 0.5) - 0.5])

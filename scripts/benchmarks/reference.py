@@ -1,8 +1,8 @@
-"""A plain stereo odometry of OpenCV's functions, as a measure of the machine.
+"""A plain stereo odometry made of OpenCV functions, as a reference for the speed of the machine.
 
-For each pair: corners by ``goodFeaturesToTrack``, matched to the right image and followed to the next left image by
-``calcOpticalFlowPyrLK``, triangulated, and the motion by ``solvePnPRansac``. Pairs come one after another, and OpenCV
-uses its own threads.
+For each pair, corners are found by ``goodFeaturesToTrack``, matched to the right image and tracked to the next left
+image by ``calcOpticalFlowPyrLK``, and triangulated; ``solvePnPRansac`` estimates the motion. Pairs are processed one
+after another, and OpenCV uses its own threads.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ class _Seen:
 
 @dataclass
 class ReferencePipeline:
-    """The reference for all pairs of a rig.
+    """The reference odometry for all pairs of a rig.
 
     Attributes:
-        rig: calibration.
-        corners: at most so many in each left image.
-        min_distance_px: least distance of two corners.
-        tracked: candidate points of the resection, for each pair and frameset.
-        inliers: points that it explained.
-        motions: ``left_T_left_prev`` (4, 4) of the newest frameset by pair, where one was found.
+        rig: rig with its calibration.
+        corners: maximum number of corners in each left image.
+        min_distance_px: minimum distance between two corners.
+        tracked: numbers of candidate points of the resection, for each pair and frameset.
+        inliers: numbers of inliers among them.
+        motions: pair index -> ``left_T_left_prev`` (4, 4) of the newest frameset, where it was found.
     """
 
     rig: Rig
@@ -57,7 +57,7 @@ class ReferencePipeline:
     _seen: dict[int, _Seen] = field(default_factory=dict)
 
     def process(self, frameset: FrameSet) -> dict[str, float]:
-        """Measure the motion of each pair; returns the milliseconds by stage."""
+        """Estimate the motion of each pair; return stage -> time in milliseconds."""
         stage_ms: dict[str, float] = {}
         self.motions = {}
         for j, (left, right) in sorted(frameset.images.items()):
@@ -109,7 +109,7 @@ def _follow(first: Image, second: Image, corners: Any) -> tuple[Any, Bool]:
 
 
 def _triangulated(pair: StereoPair, left_px: Any, right_px: Any) -> tuple[Float, Bool]:
-    """Points (N, 3) in the left camera, and whether each is in range and near its epipolar line (N,)."""
+    """Return points (N, 3) in the left camera, and whether each is in range and near its epipolar line (N,)."""
     left, right = _undistorted(pair.left, left_px), _undistorted(pair.right, right_px)
     right_T_left = pair.right_T_left
     homogeneous = cv2.triangulatePoints(np.eye(3, 4), right_T_left[:3], left.T, right.T)
@@ -122,7 +122,7 @@ def _triangulated(pair: StereoPair, left_px: Any, right_px: Any) -> tuple[Float,
 
 
 def _undistorted(camera: Camera, pixels: Any) -> Float:
-    """Normalised coordinates (N, 2) of pixels (N, 2)."""
+    """Return the normalised, undistorted coordinates (N, 2) of pixels (N, 2)."""
     given = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     if camera.model == "equidistant":
         undistorted = cv2.fisheye.undistortPoints(given, _matrix(camera), camera.distortion[:4])

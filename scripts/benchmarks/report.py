@@ -1,4 +1,4 @@
-"""A report in Markdown: printed as it grows, then written to a file or between two markers of a page in docs."""
+"""Reports in Markdown, printed while they grow, and written to a file or between two markers of a page in docs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PAGES = (
     _EXPLANATION / "benchmarks.md",
     *sorted((_EXPLANATION / "benchmarks").glob("*.md")),
 )
-"""Where reports have markers."""
+"""Pages that have markers for reports."""
 IMAGES = DOCS / "images"
 _PACKAGES = ("numpy", "numba", "opencv-python-headless", "gtsam")
 
@@ -33,7 +33,7 @@ class Report:
         self._lines: list[str] = []
 
     def add(self, *lines: str) -> None:
-        """Add lines; a heading is set off from what follows, and so are the lines from what is added next."""
+        """Add lines, with an empty line after a heading and after the last line."""
         spaced = [part for line in lines for part in ((line, "") if line.startswith("#") else (line,))]
         for line in (*spaced, ""):
             print(line)
@@ -41,7 +41,7 @@ class Report:
         sys.stdout.flush()
 
     def table(self, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table; its first column is aligned left, the others right where they hold figures."""
+        """Add a table; the first column is aligned left, and columns of figures are aligned right."""
         widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
         figures = [all(_is_figure(row[i]) for row in rows) for i in range(len(head))]
 
@@ -54,34 +54,34 @@ class Report:
 
     @property
     def text(self) -> str:
-        """The whole text, ending in a newline."""
+        """The whole text, with a newline at the end."""
         return "\n".join(self._lines).rstrip() + "\n"
 
     def save(self, path: Path) -> None:
-        """Write the report to a file, whose folder is made.
+        """Write the report to a file; its folder is created if it is missing.
 
         Raises:
-            GraphvioError: if it cannot be written.
+            GraphvioError: if the file cannot be written.
         """
         with writing(path):
             path.write_text(self.text, encoding="utf-8")
 
     def write(self, args: argparse.Namespace, name: str) -> None:
-        """Write the report where ``--out`` and ``--docs`` say, the latter between the markers of a name."""
+        """Write the report to the file of ``--out`` and, with ``--docs``, between the markers of a name in the docs."""
         if args.out is not None:
             self.save(args.out)
         if args.docs:
             self.save_to_docs(name)
 
     def save_to_docs(self, name: str, extra: str = "") -> None:
-        """Replace what stands between ``<!-- name -->`` and ``<!-- /name -->`` in README and the pages of benchmarks.
+        """Replace the text between ``<!-- name -->`` and ``<!-- /name -->`` in README and the pages of benchmarks.
 
         Args:
-            name: of the markers; every page that has them gets the report.
+            name: name of the markers; every page with these markers gets the report.
             extra: Markdown that follows the report, such as the link to a picture.
 
         Raises:
-            GraphvioError: if no page has them, or one has them twice.
+            GraphvioError: if no page has the markers, or one has them twice.
         """
         begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
         marker = re.compile(f"{re.escape(begin)}\n.*?{re.escape(end)}", re.DOTALL)
@@ -101,7 +101,7 @@ class Report:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Make the folder of a file that is written inside; an `OSError` becomes a `GraphvioError`."""
+    """Create the folder of a file that is written within the block; an `OSError` becomes a `GraphvioError`."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
@@ -115,7 +115,7 @@ def log_progress(text: str) -> None:
 
 
 def machine() -> str:
-    """One line: processor, cores, load and versions."""
+    """Return a line about the machine: processor, cores, load and versions."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     load = f", load {os.getloadavg()[0]:.1f} at the beginning" if hasattr(os, "getloadavg") else ""

@@ -41,13 +41,14 @@ class Outcome:
     Attributes:
         estimate: causal poses of all epochs, ``nav_T_body``.
         epochs: (N,) epoch of each pose.
-        by_vision: (N,) whether vision took part in it; else the odometry says that it coasts or is lost.
-        truth: of the recording.
-        evaluation: of the estimate against the truth; None where too few poses could be compared.
-        framesets: that the odometry answered.
-        motions: motions by vision that the odometry used and whose truth is known.
-        breaks: how many of them are off by more than 5 sigma of their own covariance.
-        refused: motions of the front-end that the odometry did not use.
+        by_vision: (N,) whether vision was used for each pose; otherwise the odometry has reported that it coasts or is
+            lost.
+        truth: true trajectory of the recording.
+        evaluation: comparison of the estimate with the truth; None if too few poses could be compared.
+        framesets: number of framesets for which the odometry has returned an estimate.
+        motions: number of visual motions that the odometry used and whose truth is known.
+        breaks: number of these motions that are off by more than 5 sigma of their own covariance.
+        refused: number of the front-end's motions that the odometry did not use.
     """
 
     estimate: Trajectory
@@ -62,13 +63,15 @@ class Outcome:
 
     @property
     def ate_m(self) -> float:
-        """Rmse of the position after alignment, metres; infinite where there is none."""
+        """Rmse of the position after alignment, metres; infinite if there is no evaluation."""
         return self.evaluation.ate_position_m.rmse if self.evaluation is not None else np.inf
 
     @cached_property
     def epoch_ate_m(self) -> float:
-        """The same with each epoch aligned by itself, since between them lies a declared break, and of poses by vision
-        only: before a break the odometry coasts, and says so."""
+        """ATE with each epoch aligned by itself, of poses with vision only, metres; infinite if there are none.
+
+        Between epochs is a break that the odometry reports; before it, the odometry coasts, and reports that, too.
+        """
         squares, poses = 0.0, 0
         for epoch in np.unique(self.epochs):
             rows = (self.epochs == epoch) & self.by_vision
@@ -81,11 +84,11 @@ class Outcome:
 
     @property
     def by_vision_percent(self) -> float:
-        """Framesets in whose pose vision takes part, percent."""
+        """Share of the framesets in whose pose vision was used, percent."""
         return float(100.0 * np.count_nonzero(self.by_vision) / max(self.framesets, 1))
 
     def cells(self) -> list[str]:
-        """The cells of `HEAD`."""
+        """Return the cells of a table's row below `HEAD`."""
         done = f"{100 * len(self.estimate) / max(self.framesets, 1):.0f}"
         epochs = f"{len(np.unique(self.epochs))}"
         breaks = [f"{self.breaks} / {self.motions}", f"{self.refused}", done, epochs]
@@ -116,14 +119,14 @@ HEAD = (
 def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, noise: TruthNoise = EXACT) -> Outcome:
     """Run the odometry over a recording.
 
-    Images are decoded in blocks between which nothing is timed, so that decoding takes no time from the odometry.
+    Images are decoded in blocks before these are processed, so that decoding takes no processor time from the odometry.
 
     Args:
-        recording: folder; it must hold the truth.
-        rig: pairs and IMU that are used.
-        config: of the odometry.
-        alter: applied to every frameset, or None.
-        noise: of the true poses; breaks are determined with it.
+        recording: folder of the recording, which must contain the truth.
+        rig: rig with the pairs and the IMU that are used.
+        config: configuration of the odometry.
+        alter: function that is applied to every frameset, or None.
+        noise: noise of the true poses, which is considered in the count of breaks.
 
     Raises:
         GraphvioError: if the recording cannot be read or has no truth.
@@ -133,7 +136,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
         raise GraphvioError(f"{recording}: holds no true trajectory; the accuracy cannot be measured without")
     truth = load_trajectory(source.truth)
     warm_up(source.rig, config)
-    cv2.setNumThreads(-1)  # as in a new process; the odometry then sets what it wants
+    cv2.setNumThreads(-1)  # as in a new process; the odometry then sets its own number
     odometry = Odometry(source.rig, config)
     vision_log = log_vision(odometry)
     estimates: list[Estimate] = []
@@ -177,7 +180,7 @@ def _outcome(estimates: list[Estimate], vision_log: VisionLog, truth: Trajectory
 
 
 def _statistics(motions: list[RelativeMotion], truth: Trajectory, noise: TruthNoise) -> Float:
-    """Squared Mahalanobis distances (M,) to the truth, of those motions whose truth is known at both ends."""
+    """Return squared Mahalanobis distances (M,) to the truth of those motions whose truth is known at both ends."""
     stamps_ns = np.unique([ns for m in motions for ns in (m.reference_stamp_ns, m.stamp_ns)]).astype(np.int64)
     known = truth.at(stamps_ns, MAX_GAP_S)[0]
     world_T_body = dict(zip(known.stamps_ns.tolist(), known.nav_T_body, strict=True))
@@ -192,7 +195,7 @@ def _statistics(motions: list[RelativeMotion], truth: Trajectory, noise: TruthNo
 
 
 def blinded(pair: int, start_ns: int, end_ns: int) -> Alter:
-    """Black images of one pair from one stamp to before another."""
+    """Return a function that blackens the images of one pair with stamps from ``start_ns`` to before ``end_ns``."""
 
     def alter(frameset: FrameSet) -> FrameSet:
         if pair not in frameset.images or not start_ns <= frameset.stamp_ns < end_ns:
@@ -205,13 +208,13 @@ def blinded(pair: int, start_ns: int, end_ns: int) -> Alter:
 
 
 def with_moved_pair(rig: Rig, index: int, angle_deg: float, shift_m: float) -> Rig:
-    """The rig with an error of calibration: both cameras of a pair moved together, about the pair's left camera.
+    """Return a rig with a calibration error: both cameras of a pair are moved together, about the pair's left camera.
 
     Args:
-        rig: the true one.
-        index: of the pair.
-        angle_deg: of the turn, about an axis that no camera axis is near to.
-        shift_m: length of the shift, along another such axis.
+        rig: the true rig.
+        index: index of the pair.
+        angle_deg: angle of the rotation, about an axis that is not near to any camera's axis.
+        shift_m: length of the translation, along another such axis.
     """
     axis, direction = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0), np.array([1.0, -1.0, 1.0]) / np.sqrt(3.0)
     left_T_moved = se3(so3_exp(np.deg2rad(angle_deg) * axis), shift_m * direction)

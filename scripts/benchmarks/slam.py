@@ -1,7 +1,7 @@
 """``scripts/benchmark slam``: accuracy of the reference SLAM, and relocalisation in a saved map.
 
-The command ``graphvio slam`` runs on the simulated loop at the sensors' pace, and again from other places of the same
-walk, on the same images, with the map that it saved.
+The command ``graphvio slam`` runs on the simulated loop in real time and saves a map. Then it runs again with this map,
+from other places of the same walk, on the same images.
 """
 
 from __future__ import annotations
@@ -88,19 +88,19 @@ def _truth(folder: Path) -> Trajectory:
 
 
 def _truth_T(found: Trajectory, truth: Trajectory) -> Float:
-    """``truth_T_map`` (4, 4) that fits a path best."""
+    """Return the transform ``truth_T_map`` (4, 4) that aligns a trajectory with the truth best."""
     true, known = truth.at(found.stamps_ns, _GAP_S)
     return np.ascontiguousarray(align(found.select(known), true))
 
 
 def _off(found: Trajectory, truth: Trajectory, truth_T_map: Float) -> Float:
-    """Distances (N,) of positions from the truth."""
+    """Return the distances (N,) of a trajectory's positions from the truth, metres."""
     true, known = truth.at(found.stamps_ns, _GAP_S)
     return np.asarray(np.linalg.norm(found.select(known).transformed(truth_T_map).positions - true.positions, axis=1))
 
 
 def _smoothness(folder: Path, out: Path) -> str:
-    """Largest step of odom between framesets, and the largest by which one differs from the true step."""
+    """Return a sentence on the steps of odom between framesets: the largest, and the largest error of one."""
     odom = load_trajectory(out / "odometry.txt")
     true, known = _truth(folder).at(odom.stamps_ns, _GAP_S)
     measured, expected = _steps(odom.select(known)), _steps(true)
@@ -112,7 +112,7 @@ def _smoothness(folder: Path, out: Path) -> str:
 
 
 def _steps(path: Trajectory) -> Float:
-    """Translations (N - 1, 3), in body."""
+    """Return the translations (N - 1, 3) from each pose to the next, in body."""
     poses = [np.ascontiguousarray(pose) for pose in path.nav_T_body]
     return np.array([(se3_inverse(a) @ b)[:3, 3] for a, b in pairwise(poses)])
 

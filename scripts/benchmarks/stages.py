@@ -1,4 +1,4 @@
-"""``scripts/benchmark stages``: the processor time of a frameset by stage, which other programs hardly change."""
+"""``scripts/benchmark stages``: processor time per frameset by stage, on which other programs have little effect."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the times, and report and draw them."""
     count = WARM_UP + args.framesets
     folder = args.recording or simulated(args.data, "room", math.ceil((count + 1) / _RATE_HZ))
     log_progress("decoding")
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _times_ms(footage: Footage, config: Config) -> dict[str, list[float]]:
-    """Collect the processor time of each counted frameset by stage, and that of all threads."""
+    """Return the processor times of each counted frameset, milliseconds: by stage, and of all threads together."""
     timing.clock = time.thread_time  # the stages' own stopwatches then count processor time
     odometry, times = Odometry(footage.rig, config), dict[str, list[float]]()
     try:
@@ -86,7 +86,7 @@ def _times_ms(footage: Footage, config: Config) -> dict[str, list[float]]:
 
 
 def draw(path: Path, times: dict[str, list[float]]) -> None:
-    """Draw a bar for each stage: the median, and a line to the 99th percentile.
+    """Draw a bar for each stage, with the median and a line up to the 99th percentile.
 
     Raises:
         GraphvioError: if the picture cannot be written.

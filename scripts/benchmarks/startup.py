@@ -1,4 +1,4 @@
-"""``scripts/benchmark startup``: how long it takes until the first pose, with compiled kernels and without."""
+"""``scripts/benchmark startup``: the time until the first pose, with compiled kernels and without."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine
 from graphvio.errors import GraphvioError
 
-_RECORDED_S = 12.0  # that other benchmarks have rendered, too
+_RECORDED_S = 12.0  # seconds of the recording; other benchmarks use the same one
 _PARTS = ("import", "open", "kernels", "first pose")
 _COMMANDS = {
     "`import graphvio`": (["-c", "import graphvio"], None),
@@ -30,7 +30,7 @@ _COMMANDS = {
 
 
 class _Case(NamedTuple):
-    """A way to the first pose, and the aims for it in seconds."""
+    """Sensors that are used, and the aims in seconds for the first pose with compiled kernels (warm) and without."""
 
     name: str
     pairs: str
@@ -63,7 +63,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and report."""
+    """Measure the times and report them next to the aims."""
     if args.rounds < 1:
         raise GraphvioError("--rounds: give one or more")
     recording = simulated(args.data, "room", _RECORDED_S)
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
     )
     rows = []
     for case in _CASES:
-        _first_pose(recording, case, None)  # compiles what is missing
+        _first_pose(recording, case, None)  # compiles the kernels that are missing
         laps = [_first_pose(recording, case, None) for _ in range(args.rounds)]
         typical = {part: median(lap[part] for lap in laps) for part in _PARTS}
         rows.append(_row(f"warm, {case.name}", typical, case.aim_warm_s))
@@ -121,7 +121,7 @@ def _first_pose(recording: Path, case: _Case, cache: str | None) -> dict[str, fl
 
 
 def _timed(arguments: Sequence[str], cache: str | None) -> _Timed:
-    """Run Python in a process of its own, with the user's cache of kernels or another folder."""
+    """Run Python in a new process, with the user's cache of kernels or another folder."""
     environment = dict(os.environ) if cache is None else {**os.environ, "GRAPHVIO_CACHE_DIR": cache}
     before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter()
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Timing of several pipelines on the same framesets, in turns, so that all of them run under a similar load."""
+"""Timing of several pipelines that process the same framesets in turns, so that the load is similar for all."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from graphvio.frontend.visual import VisualFrontend
 from graphvio.odometry import Odometry
 
 WARM_UP = 20
-"""The first framesets are not counted: caches fill, and the odometry initialises."""
-_TURN = 10  # framesets; a change of turns costs OpenCV's threads their start, so it is not made at every frameset
+"""Number of framesets at the beginning that are not counted, while caches fill and the odometry initialises."""
+_TURN = 10  # framesets in a turn: more than one, since each change of turns makes OpenCV create its threads again
 _OWN_THREADS = -1
 
 
@@ -30,7 +30,7 @@ class Contender(Protocol):
     """Number of OpenCV's threads during this pipeline's turn."""
 
     def step(self, index: int) -> dict[str, float]:
-        """Work on the next frameset; returns the milliseconds by stage, as the pipeline itself reports them."""
+        """Process the next frameset; return stage -> milliseconds, as the pipeline reports them itself."""
 
     def close(self) -> None:
         """End its threads."""
@@ -38,13 +38,13 @@ class Contender(Protocol):
 
 @dataclass
 class Timings:
-    """Milliseconds for each counted frameset, in all and by stage."""
+    """Milliseconds for each counted frameset, in total and by stage."""
 
     total_ms: list[float] = field(default_factory=list)
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, other: Timings) -> None:
-        """Take another's framesets as well."""
+        """Add the framesets of other timings."""
         self.total_ms += other.total_ms
         for name, values in other.stage_ms.items():
             self.stage_ms.setdefault(name, []).extend(values)
@@ -61,10 +61,10 @@ class Timings:
 
 
 def take_turns(contenders: Sequence[Contender], count: int) -> list[Timings]:
-    """Time pipelines on framesets 0 to ``count``, ten framesets at a time; who begins changes from turn to turn.
+    """Time pipelines on framesets 0 to ``count`` in turns of ten framesets; the order changes from turn to turn.
 
     Returns:
-        Timings of each, of the framesets from `WARM_UP` on.
+        Timings of each pipeline, for the framesets from `WARM_UP` on.
     """
     timings = [Timings() for _ in contenders]
     try:
@@ -93,7 +93,7 @@ def _step(contender: Contender, index: int, timings: Timings) -> None:
 
 
 def _set_opencv_threads(threads: int) -> None:
-    """Set their number, and have them started before the clock runs."""
+    """Set the number of OpenCV's threads, and let OpenCV create them before the time is measured."""
     cv2.setNumThreads(threads)
     noise = np.zeros((480, 640), dtype=np.uint8)
     for _ in range(2):
@@ -102,20 +102,20 @@ def _set_opencv_threads(threads: int) -> None:
 
 
 class FrontendContender:
-    """The front-end alone, with the prediction that the last motion continues."""
+    """The front-end alone; its prediction is that the last motion continues."""
 
     def __init__(self, footage: Footage, config: Config) -> None:
         cv2.setNumThreads(_OWN_THREADS)
         self._frontend = VisualFrontend(footage.rig, config)
-        self.opencv_threads = cv2.getNumThreads()  # as the front-end wants it
+        self.opencv_threads = cv2.getNumThreads()  # as set by the front-end
         self._framesets = footage.framesets
         self._predictor = SteadyMotion()
         self.tracks: list[int] = []
-        """Corners followed in the left image, for each counted frameset and pair."""
+        """Number of tracks in the left image, for each counted frameset and pair."""
         self.points: list[int] = []
-        """Candidate points of the estimation, likewise."""
+        """Number of candidate points of the estimation, for each counted frameset and pair."""
         self.failures = 0
-        """Counted framesets without a motion."""
+        """Number of counted framesets without a motion."""
 
     def step(self, index: int) -> dict[str, float]:
         """Time one frameset."""

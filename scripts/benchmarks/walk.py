@@ -1,7 +1,8 @@
-"""``scripts/benchmark walk``: the README's picture and animation: the corridor with the IMU, by all pairs and by each.
+"""``scripts/benchmark walk``: the README's picture and animation of the corridor, with all pairs and with each alone.
 
-``scripts/benchmark accuracy --docs`` writes them as well, from the runs of its tables. The picture holds its figures as
-a PNG text, which a test compares with the README's table: both are of one run.
+All runs use the IMU. ``scripts/benchmark accuracy --docs`` also writes picture and animation, from the runs of its
+tables. The PNG file contains its figures as text, which a test compares with the README's table, so that both are of
+the same run.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from graphvio.simulation.scenes import build_scene
 SCENE, PROFILE = "corridor", "default"
 PNG_NAME, ANIMATION_NAME = "walk.png", "walk.webp"
 FIGURES_KEY = "figures"
-"""Name of the PNG's text with the ATE of each run in millimetres, as JSON."""
+"""Key of the text in the PNG file that has the ATE of each run in millimetres, as JSON."""
 _TITLES = {"door": "a door swings open", "people": "a crowd", "blank": "a blank bend", "dim": "the lamps fail"}
 _SIDES = (("front", 0), ("back", 2))
 _COLOURS = (BLUE, RED, "#d98200")  # all pairs together first
@@ -55,7 +56,7 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def draw_walk(bench: Bench, folder: Path) -> None:
-    """Write picture and animation of the whole corridor into a folder.
+    """Write the picture and the animation of the whole corridor into a folder.
 
     Raises:
         GraphvioError: if the walk cannot be run, or the files cannot be written.
@@ -75,8 +76,8 @@ class _Walk:
     Attributes:
         runs: name of the pairs -> run, all pairs first.
         files: image files of the left camera of each pair, in the order of their stamps.
-        moments: name of a hard moment -> when it begins and ends, seconds.
-        duration_s: of the recording.
+        moments: name of a hard moment -> its start and end, seconds.
+        duration_s: duration of the recording.
     """
 
     runs: dict[str, Outcome]
@@ -101,7 +102,7 @@ class _Walk:
         return int(self.files["front"][0].stem)
 
     def image(self, side: str, time_s: float) -> Image:
-        """The image nearest to a time, cut to a wide format."""
+        """Return the image nearest to a time, cropped to a wide format."""
         at_ns = self.begin_ns + round(1e9 * time_s)
         file = min(self.files[side], key=lambda each: abs(int(each.stem) - at_ns))
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
@@ -109,13 +110,13 @@ class _Walk:
         return np.ascontiguousarray(image[_ROWS], dtype=np.uint8)
 
     def errors_cm(self, outcome: Outcome) -> tuple[Float, Float]:
-        """Times in seconds, and the position error after alignment of the whole run, centimetres."""
+        """Return times in seconds, and the position errors after alignment of the whole run, centimetres."""
         assert outcome.evaluation is not None  # the benchmark's own recordings can be evaluated
         times_s = np.asarray(1e-9 * (outcome.evaluation.stamps_ns - self.begin_ns), dtype=np.float64)
         return times_s, 100 * outcome.evaluation.position_error_m
 
     def picture(self) -> Figure:
-        """The hard moments as both pairs see them, above the errors."""
+        """Return the figure: images of both pairs at the hard moments, and the errors over time below them."""
         figure = empty_figure(9.6, 5.0, dpi=130)
         for column, (name, (begin_s, end_s)) in enumerate(self.moments.items()):
             for row, (side, _) in enumerate(_SIDES):
@@ -129,7 +130,7 @@ class _Walk:
         return figure
 
     def _error_axes(self, figure: Figure, place: tuple[float, float, float, float]) -> list[Any]:
-        """Add the errors over time; returns their lines, in the order of the runs."""
+        """Add axes with the errors over time; return the lines, in the order of the runs."""
         axes = add_axes(figure, place)
         lines: list[Any] = []
         highest = max(float(self.errors_cm(outcome)[1].max()) for outcome in self.runs.values())
@@ -149,7 +150,7 @@ class _Walk:
         return lines
 
     def save_animation(self, path: Path) -> None:
-        """Write the walk at five times its speed: what the pairs see, where the rig is, and the errors so far."""
+        """Write an animation at five times the speed: the pairs' images, the rig's position, and the errors so far."""
         figure = empty_figure(7.2, 4.2, dpi=100)
         views = [figure.add_axes((0.01 + 0.325 * i, 0.535, 0.32, 0.427)) for i in range(2)]
         shown = [_show(axes, self.image(side, 0.0)) for axes, (side, _) in zip(views, _SIDES, strict=True)]

@@ -1,8 +1,9 @@
 """``scripts/campaign calibration``: the accuracy of P_12, and its effect on the odometry.
 
-Three parts. Synthetic errors: 200 runs at each of several noise levels and shares of outliers, compared with the
-covariance. Images: two minutes of the scene ``calibration``, of which more and more framesets are used. Odometry:
-every scene with the true rig, with the one that was found from images, and with one that is 3 degrees and 5 cm wrong.
+There are three parts. Synthetic errors: 200 runs at each of several noise levels and shares of outliers, whose errors
+are compared with the covariance. Images: two minutes of the scene ``calibration``, of which more and more framesets are
+used. Odometry: every scene with the true rig, with the rig calibrated from these images, and with a rig that is 3
+degrees and 5 cm wrong.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from graphvio.errors import GraphvioError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.sources import open_source
 
-_NOISES = ((2e-4, 4e-4), (1e-3, 2e-3), (4e-3, 8e-3))  # of a motion over a third of a second: radians, metres
+_NOISES = ((2e-4, 4e-4), (1e-3, 2e-3), (4e-3, 8e-3))  # sigmas of a motion over a third of a second: radians, metres
 _OUTLIERS = (0.0, 0.3, 0.6)
 _FRAMESETS = (50, 100, 200, 400, 800, 1600, 2400)
 _SECONDS = 120.0
@@ -114,7 +115,7 @@ def _cells(runs: list[Run]) -> list[str]:
 
 
 def _growth(recording: Path) -> tuple[Calibration, list[list[str]]]:
-    """The calibration from all framesets, and a row for each number of them."""
+    """Return the calibration from all framesets, and a row of the table for each number of framesets."""
     rows: list[list[str]] = []
     truth = open_source(recording).rig.left2_T_left1()
 

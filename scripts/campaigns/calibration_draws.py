@@ -1,4 +1,4 @@
-"""Pose pairs with synthetic errors, on the walk of the scene ``calibration``, solved by both methods."""
+"""Calibration by both methods from pose pairs with synthetic errors, on the walk of the scene ``calibration``."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from graphvio.simulation.default_rig import default_rig
 
 PAIRS = 300
 INTERVAL_S = 0.35
-_RANDOM_TURN, _RANDOM_STEP_M = 0.15, 0.1  # of outliers
+_RANDOM_TURN, _RANDOM_STEP_M = 0.15, 0.1  # sigmas of outliers' rotations, radians, and translations, about each axis
 
 
 class Run(NamedTuple):
-    """One run.
+    """Result of one run.
 
     Attributes:
-        rotation_rad: error of the graph's result.
-        translation_m: the same.
-        paper_rotation_rad: error of the paper's method.
-        paper_translation_m: the same.
+        rotation_rad: rotation error of the graph's result.
+        translation_m: translation error of the graph's result.
+        paper_rotation_rad: rotation error of the paper's method.
+        paper_translation_m: translation error of the paper's method.
         square: squared Mahalanobis distance of the graph's result from the truth.
-        outliers_kept: outliers that count as inliers.
+        outliers_kept: number of outliers that were taken for inliers.
         outliers: number of sampled outliers.
-        inliers_lost: other pose pairs that count as outliers.
-        agrees: whether the two methods were found to agree.
+        inliers_lost: number of other pose pairs that were taken for outliers.
+        agrees: whether the comparison of the two methods found that they agree.
     """
 
     rotation_rad: float
@@ -46,13 +46,13 @@ class Run(NamedTuple):
 
 
 def one_run(seed: int, rotation_rad: float, translation_m: float, outlier_share: float) -> Run:
-    """Sample pose pairs, solve by both methods, and compare with the truth.
+    """Sample pose pairs, calibrate by both methods, and compare the results with the truth.
 
     Args:
-        seed: of errors and outliers, and of the method's random triples.
+        seed: seed of errors and outliers, and of the method's random triples.
         rotation_rad: sigma of each motion's rotation, about each axis.
-        translation_m: sigma of its translation, along each axis.
-        outlier_share: of motions of the second camera that have nothing to do with the first's.
+        translation_m: sigma of each motion's translation, along each axis.
+        outlier_share: share of the second camera's motions that are random, and independent of the first camera's.
     """
     rng = np.random.default_rng(seed)
     rig = default_rig()

@@ -1,8 +1,8 @@
-"""``scripts/campaign consistency``: is the smoother consistent?
+"""``scripts/campaign consistency``: NEES and NIS of the smoother over many runs.
 
-Walks of the simulator's scenes are estimated many times, each with other errors of IMU, initial state and vision. Those
-of vision are sampled from the covariances that the front-end reports on rendered images of a room; in a second set the
-whole odometry runs on rendered images, and only the IMU differs between runs.
+Walks of the simulator's scenes are estimated many times, each time with different errors of the IMU, the initial state
+and vision. Errors of vision are sampled from the covariances that the front-end reports on rendered images of a room.
+In a second set of runs, the whole odometry processes rendered images, and only the IMU differs between runs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NAMES = {
 }
 SYNTHETIC_NAMES = NAMES | {"imu": "the preintegrated IMU at the true states"}
 RENDERED_NAMES = NAMES | {f"pose over 10 s{WITHOUT_SHARE}": f"relative pose over 10 s{WITHOUT_SHARE}"}
-_WHERE = "room"  # on whose images the covariances are found
+_WHERE = "room"  # scene on whose images the front-end's covariances are measured
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

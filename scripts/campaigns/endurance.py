@@ -1,7 +1,8 @@
-"""``scripts/campaign endurance``: are time, memory and errors of the back-end constant over an hour?
+"""``scripts/campaign endurance``: time, memory and errors of the back-end over an hour, which should stay constant.
 
-The rig walks rounds through a room, with an IMU whose biases drift and motions by vision that are sampled around the
-truth. Time per frameset, memory of the process, errors of the state and their sigmas are reported for each part.
+The rig walks in rounds through a room, with an IMU whose biases drift and visual motions that are sampled around the
+truth. Time per frameset, memory of the process, errors of the state and their sigmas are reported for each part of the
+hour.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from graphvio.simulation.motion import Walk
 _PARTS = 6
 _CORNERS_M = np.array([[2.6, 2.1, 1.45], [-2.6, 2.1, 1.45], [-2.6, -2.1, 1.45], [2.6, -2.1, 1.45]])
 _SPEED_M_S = 1.05
-_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
+_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of visual motions from frame to frame: rad and metres
 _HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "events", "position, m, sigma",
          "tilt, deg", "sigma", "gyro bias, mrad/s", "sigma")  # fmt: skip
 
@@ -115,7 +116,7 @@ def _motion(world_T_body: Float, stamps: list[int], k: int, rng: np.random.Gener
 
 
 def _errors(estimator: SmootherEstimator, world_T_body: Float, gyro_bias: Float) -> list[str]:
-    """Sigma of the position; error and sigma of the tilt; of the gyro's bias."""
+    """Return cells: sigma of the position; error and sigma of the tilt; error and sigma of the gyro's bias."""
     state, known = estimator.state(), estimator.covariance
     assert known.gyro_bias is not None
     assert known.tilt is not None
@@ -134,6 +135,6 @@ def _sigma(covariance: Float) -> float:
 
 
 def _memory_mb() -> float:
-    """Resident memory of the process."""
+    """Return the resident memory of the process, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 2**20

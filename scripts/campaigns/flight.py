@@ -1,4 +1,4 @@
-"""A recorded IMU with its truth, in an EuRoC folder."""
+"""A recorded IMU and the truth, read from an EuRoC folder."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from graphvio.trajectory_files import load_trajectory
 FRAMES_HZ = 20
 STEP_NS = 1_000_000_000 // FRAMES_HZ
 _MAX_GAP_S = 0.05
-_BIAS_COLUMNS = range(11, 17)  # gyro, accelerometer
+_BIAS_COLUMNS = range(11, 17)  # columns of the biases of gyro and accelerometer
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """States of the IMU.
+    """True states of the IMU.
 
     Attributes:
-        world_T_body: (N, 4, 4).
-        velocity_world: (N, 3) m/s.
-        gyro_bias: (N, 3) rad/s.
-        accel_bias: (N, 3) m/s^2.
+        world_T_body: (N, 4, 4) poses.
+        velocity_world: (N, 3) velocities in world, m/s.
+        gyro_bias: (N, 3) biases of the gyro, rad/s.
+        accel_bias: (N, 3) biases of the accelerometer, m/s^2.
     """
 
     world_T_body: Float
@@ -42,12 +42,12 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """The IMU in steps of 50 ms, and the states that the file has there.
+    """The IMU readings in steps of 50 ms, and the true states of the file at the stamps between them.
 
     Attributes:
-        stamps_ns: N of them.
-        intervals: N - 1, the IMU from each stamp to the next.
-        recorded: states of the file; the velocities are those of its positions.
+        stamps_ns: stamps of the N states.
+        intervals: IMU readings from each stamp to the next, N - 1 intervals.
+        recorded: states of the file; the velocities are derived from its positions.
     """
 
     stamps_ns: list[int]
@@ -80,7 +80,7 @@ class Flight:
 
 
 def _bias_columns(path: Path, rows: int) -> Float:
-    """Biases (N, 6) of gyro and accelerometer."""
+    """Read the biases (N, 6) of gyro and accelerometer from the file of the truth."""
     try:
         columns = np.loadtxt(path, delimiter=",", comments="#", usecols=_BIAS_COLUMNS)
     except (ValueError, IndexError) as error:
@@ -91,7 +91,7 @@ def _bias_columns(path: Path, rows: int) -> Float:
 
 
 def _intervals(table: ImuTable, stamps_ns: Int, folder: Path) -> Iterator[ImuInterval]:
-    """The IMU between stamps (N,), as the odometry's own buffer gives it."""
+    """Yield the IMU readings between consecutive stamps (N,), as the odometry's buffer returns them."""
     buffer, added = ImuBuffer(1e3 * _MAX_GAP_S), 0
     for start_ns, end_ns in zip(stamps_ns[:-1].tolist(), stamps_ns[1:].tolist(), strict=True):
         while not buffer.covers(end_ns):

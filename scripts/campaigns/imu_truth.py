@@ -1,7 +1,8 @@
-"""The truth of a recorded IMU, reconstructed from the recorded positions and the IMU alone.
+"""Reconstruction of a recorded IMU's true states from the recorded positions and the IMU alone.
 
-The orientations of such a file need not be those of the IMU. A batch over all of the recording does not use them: its
-unknowns are the IMU's poses, velocities and biases, and the point of the body whose positions were measured.
+The orientations in such a recording may differ from those of the IMU, so they are not used. A batch optimisation over
+the whole recording estimates the IMU's poses, velocities and biases, and the point of the body whose positions were
+measured.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ _LEVER_ARM = int(gtsam.symbol("l", 0))
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Result of a batch over a flight.
+    """Result of the batch optimisation over a flight.
 
     Attributes:
-        truth: the states.
-        lever_arm: (3,) m, body: where the positions were measured.
-        chi_square: twice the cost that is left.
-        freedom: its expectation, the number of residuals less that of unknowns.
+        truth: the reconstructed states.
+        lever_arm: (3,) m, in body: the point whose positions were measured.
+        chi_square: twice the cost of the solution.
+        freedom: expected value of ``chi_square``: the number of residuals minus that of unknowns.
     """
 
     truth: Truth
@@ -57,13 +58,14 @@ class Reconstruction:
 
 
 def reconstruct(flight: Flight, imu: Imu, noise_scale: float, rounds: int = 2) -> Reconstruction:
-    """Fit positions and IMU.
+    """Estimate the states that fit the positions and the IMU of a flight.
 
     Args:
-        flight: whose positions are taken, and whose orientations are where the search begins.
-        imu: its noise densities.
-        noise_scale: factor on them.
-        rounds: each preintegrates the IMU at the biases of the one before, the first at zero.
+        flight: the flight; its orientations are used only as initial values.
+        imu: model with the IMU's noise densities.
+        noise_scale: factor on the noise densities.
+        rounds: number of optimisations; each preintegrates the IMU at the biases of the previous one, the first at
+            zero.
     """
     recorded, zeros = flight.recorded, np.zeros_like(flight.recorded.gyro_bias)
     truth, lever_arm = Truth(recorded.world_T_body, recorded.velocity_world, zeros, zeros), np.zeros(3)
@@ -72,7 +74,7 @@ def reconstruct(flight: Flight, imu: Imu, noise_scale: float, rounds: int = 2) -
         graph = _graph(flight, truth, params)
         values = gtsam.LevenbergMarquardtOptimizer(graph, _values(truth, lever_arm)).optimize()
         truth, lever_arm = _truth(values, len(flight.stamps_ns)), np.asarray(values.atVector(_LEVER_ARM))
-    # A position has three residuals, a step as many as a state has unknowns; the first biases have a prior.
+    # A position has three residuals, and a step has as many as a state has unknowns; the first biases have a prior.
     freedom = 3 * len(flight.stamps_ns) - 15 + 6
     return Reconstruction(truth, lever_arm, 2.0 * graph.error(values), freedom, gtsam.Marginals(graph, values))
 
@@ -84,7 +86,7 @@ def turns(recorded: Truth, found: Truth) -> Float:
 
 
 def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
-    """Return the mean specific force (N - 1, 3) m/s^2 of each step less that of a truth, in body with bias."""
+    """Return the errors (N - 1, 3) m/s^2 of each step's mean specific force against a truth, in body, bias included."""
     step_s, up = 1e-9 * STEP_NS, np.array([0.0, 0.0, GRAVITY_M_S2])
     params, errors = preintegration_params(imu, 1.0), np.empty((len(flight.intervals), 3))
     for k, (interval, bias) in enumerate(zip(flight.intervals, _biases(truth)[:-1], strict=True)):
@@ -95,13 +97,13 @@ def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
 
 
 def with_synthetic_forces(flight: Flight, errors: Float, density: float, seed: int) -> Flight:
-    """Return a flight whose forces are those of a truth with a constant bias and white noise.
+    """Return a flight with the specific forces of a truth, a constant bias and white noise.
 
     Args:
-        flight: with the measured forces.
-        errors: (N - 1, 3) m/s^2, `force_errors` of that truth; their mean stays.
-        density: of the noise, m/s^2/sqrt(Hz).
-        seed: of the noise.
+        flight: the flight with the measured forces.
+        errors: (N - 1, 3) m/s^2, `force_errors` of that truth; their mean is the bias.
+        density: density of the noise, m/s^2/sqrt(Hz).
+        seed: seed of the noise.
     """
     rng, intervals = np.random.default_rng([seed, 13]), []
     for interval, off in zip(flight.intervals, errors - errors.mean(axis=0), strict=True):
@@ -112,7 +114,7 @@ def with_synthetic_forces(flight: Flight, errors: Float, density: float, seed: i
 
 
 def allan_deviation(values: Float, steps: int) -> Float:
-    """Return the Allan deviation (M,) of the columns of values (N, M), between means over so many steps."""
+    """Return the Allan deviation (M,) of the columns of ``values`` (N, M), for means over ``steps`` rows."""
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     means = (sums[steps:] - sums[:-steps]) / steps
     return np.asarray(np.sqrt(0.5 * np.mean((means[steps:] - means[:-steps]) ** 2, axis=0)))

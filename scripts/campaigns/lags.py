@@ -1,8 +1,8 @@
 """``scripts/campaign lags``: the gain of a longer lag and more iterations over the paper's filter.
 
-The filter's model as a factor graph, with a lag of one step and one iteration, is the filter. Here both grow, on walks
-of the simulator with sampled errors of vision and IMU and without vision for a second in every five; the odometry's
-smoother is compared with them on the same measurements.
+The paper's filter equals a factor graph of its model with a lag of one step and one iteration. Here lag and iterations
+are increased, on simulated walks with sampled errors of vision and IMU, and without vision for one second in every
+five. The odometry's smoother is compared with them on the same measurements.
 """
 
 from __future__ import annotations
@@ -62,7 +62,11 @@ def main(args: argparse.Namespace) -> None:
 
 
 def one_run(seed: int, duration_s: float) -> dict[str, dict[str, Track]]:
-    """All estimators on the same measurements: name -> ``newest`` and ``leaving``."""
+    """Run all estimators on the same measurements.
+
+    Returns:
+        Name of the estimator -> errors of the states when they were ``newest``, and when ``leaving`` the window.
+    """
     run = PaperRun(seed, duration_s)
     made = {"filter": run.by_filter(), "smoother": run.by_smoother()}
     return made | {f"{lag}, {iterations}": run.by_graph(lag, iterations) for lag, iterations in LAGS}
@@ -84,6 +88,6 @@ def _row(name: str, lag: str, iterations: str, runs: list[dict[str, Track]]) -> 
 
 
 def _rms(errors: list[Float]) -> str:
-    """Root mean square over all runs of the lengths of errors (N, M) or (N,), or nothing where they are not known."""
+    """Return the root mean square, over all runs, of the norms of errors (N, M) or (N,); "" if they are not known."""
     mean = float(np.mean([np.mean(np.sum(np.atleast_2d(each.T) ** 2, axis=0)) for each in errors]))
     return "" if np.isnan(mean) else f"{np.sqrt(mean):.2f}"

@@ -1,6 +1,6 @@
-"""``scripts/campaign live``: the live system in real time, with faults of sensors and machine.
+"""``scripts/campaign live``: the live system in real time, with faults of the sensors and the machine.
 
-Each case runs the simulated room, walked to and fro, through the whole live system at the sensors' pace.
+In each case, the whole live system runs in real time on the simulated room, which is walked to and fro.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _HEAD = ("case", "framesets", "skipped", "least corners, %", "p50, ms", "p99, ms
 
 @dataclass(frozen=True)
 class _Case:
-    """Options of the simulated devices; ``stalls_s`` blocks the output for so long, once."""
+    """Name of a case, options of the simulated devices, and for how long the output is blocked once, seconds."""
 
     name: str
     options: str = ""
@@ -116,7 +116,7 @@ def _run(case: _Case, folder: Path, seconds: float) -> list[str]:
 
 
 class _Stall(Output):
-    """Blocks the output once, at the hundredth result."""
+    """An output that blocks once, at the hundredth result."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
@@ -130,7 +130,7 @@ class _Stall(Output):
 
 
 def _killed(folder: Path, after_s: float) -> float:
-    """Seconds of a recording that are lost when the process is killed so long after its file appeared."""
+    """Kill a recording process ``after_s`` seconds after its file appeared; return how many seconds are lost in it."""
     with tempfile.TemporaryDirectory() as made:
         out = Path(made) / "killed.mcap"
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", "live"]

@@ -1,4 +1,4 @@
-"""The errors and times of a live run on a simulated scene that is walked to and fro."""
+"""A listener that measures errors and times of a live run on a simulated scene, which is walked to and fro."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _STAGES = ("predict", "track", "motion", "quality", "replenish", "update")
 
 
 class Listener:
-    """Takes estimates in a thread of its own until the run has ended.
+    """Receives the estimates in its own thread until the run has ended.
 
     Args:
-        running: not started yet.
-        folder: of the recording, whose first frameset is the first estimate's.
+        running: the live odometry, before its start.
+        folder: folder of the recording; its first frameset corresponds to the first estimate.
 
     Attributes:
-        work_ms: processing time of each frameset.
-        error_mm: of the newest position, from the first pose on.
-        epochs: so far.
-        thread: that takes the estimates.
+        work_ms: processing time of each frameset, milliseconds.
+        error_mm: error of the newest position relative to the first pose, millimetres.
+        epochs: number of epochs so far.
+        thread: the thread that receives the estimates.
     """
 
     def __init__(self, running: LiveOdometry, folder: Path) -> None:
@@ -58,10 +58,10 @@ class Listener:
             self.error_mm = 1e3 * float(np.linalg.norm(apart))
 
     def _true_pose(self, stamp_ns: int) -> Float:
-        """The true pose nearest to a stamp's position in the walk to and fro."""
+        """Return the true pose that is nearest to a stamp, (4, 4), in the walk to and fro."""
         length_ns = self._end_ns - self._start_ns
         assert self._first_ns is not None
-        along_ns = (stamp_ns - self._first_ns) % (2 * length_ns)  # for stamps of any clock
+        along_ns = (stamp_ns - self._first_ns) % (2 * length_ns)  # of an arbitrary clock
         wanted_ns = self._start_ns + min(along_ns, 2 * length_ns - along_ns)
         at = int(np.argmin(np.abs(self._truth.stamps_ns - wanted_ns)))
         return np.ascontiguousarray(self._truth.nav_T_body[at])

@@ -1,4 +1,4 @@
-"""All services of a live odometry: recording, gRPC, ROS 2 and metrics, with a gRPC client in another process."""
+"""All services of a live odometry: recording, gRPC, ROS 2 and metrics; and a gRPC client in another process."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Services:
     """The running services.
 
     Attributes:
-        recorder: of a session.
-        client: process that takes all keyframes by gRPC.
-        publisher: on ROS 2.
+        recorder: recorder of a session.
+        client: process of a client that receives all keyframes by gRPC.
+        publisher: publisher of ROS 2 topics.
     """
 
     recorder: SessionRecorder
@@ -37,7 +37,7 @@ class Services:
 
     @classmethod
     def start(cls, running: LiveOdometry, path: Path, waits: bool, stack: ExitStack) -> Services:
-        """Start all services, until the stack is closed; before the odometry is started."""
+        """Start all services, which run until the stack is closed; to be called before the odometry's start."""
         recorder = SessionRecorder(path, running.rig, waits=waits)
         stack.callback(recorder.close)
         running.add_output(recorder)
@@ -47,11 +47,11 @@ class Services:
         client = subprocess.Popen([sys.executable, "-c", _CLIENT, server.address], stdout=subprocess.PIPE, text=True)
         stack.callback(client.kill)
         assert client.stdout is not None
-        client.stdout.readline()  # it is connected
+        client.stdout.readline()  # a line means that the client is connected
         return cls(recorder, client, publisher)
 
     def summary(self) -> str:
-        """Return how much each has received, after the end."""
+        """Return a sentence on what recorder and client have received; to be called after the end of the run."""
         self.publisher.check()
         received, _ = self.client.communicate(timeout=_END_S)
         self.recorder.close()
@@ -63,7 +63,7 @@ class Services:
 
 
 def listen(address: str) -> None:
-    """Take all keyframes with their images, in the client's process."""
+    """Receive all keyframes with their images; called in the client's process."""
     with Client(address) as client:
         print("connected", flush=True)
         ids = [keyframe.id for keyframe in client.keyframes(with_images=True)]

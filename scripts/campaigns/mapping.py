@@ -1,7 +1,7 @@
 """``scripts/campaign mapping``: the reference SLAM by itself, on rendered images and poses with synthetic drift.
 
-The errors are those of mapping and not of an odometry: the front-end's keyframes are true poses with a random walk
-added, and consistent covariances. Then sessions begin in a saved map.
+The errors are those of the mapping and not of an odometry: the keyframes have true poses plus a random walk, with
+consistent covariances. Then other sessions begin in a saved map.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "loop"
 _STEP = 5  # framesets from keyframe to keyframe: four a second
-_SIGMAS = (np.deg2rad(0.02), 0.01)  # of the drift after a metre
+_SIGMAS = (np.deg2rad(0.02), 0.01)  # sigmas of the drift after a metre, rad and m
 _SESSION_BEGINS_S = (3.0, 35.0, 66.5)
 _SESSION_S = 5.0
 _GAP_S = 0.1
-_WRONG_M, _WRONG_RAD = 0.5, 0.1  # closures farther off join different places
+_WRONG_M, _WRONG_RAD = 0.5, 0.1  # closures with larger errors are taken to join different places
 _DRIFT_HEAD = ("draw", "error at the end, mm", "after mapping, mm", "rmse, mm", "after mapping, mm", "places",
                "closures found", "wrong among them", "used", "wrong among them")  # fmt: skip
 _CORRECTIONS_HEAD = ("draw", "corrections", "squared error by covariance: median", "greatest", "expected")
@@ -84,12 +84,12 @@ class _Run:
     """Result of one run.
 
     Attributes:
-        truth: (N, 4, 4) of the keyframes, in the map's frame.
-        drifted: (N, 4, 4) of the front-end.
-        mapped: at the end.
-        corrections: as the front-end had them.
-        closures: motion found, true motion, whether used.
-        summary: of the mapper.
+        truth: (N, 4, 4) true poses of the keyframes, in the map's frame.
+        drifted: (N, 4, 4) poses of the front-end, with drift.
+        mapped: trajectory of the mapper at the end.
+        corrections: corrections that the front-end received.
+        closures: for each loop closure the estimated motion, the true motion, and whether it is used.
+        summary: summary of the mapper.
     """
 
     truth: Float
@@ -101,7 +101,10 @@ class _Run:
 
 
 def _run(source: Source, draw: int, indices: Int, begin: Path | None, keep: Path | None) -> _Run:
-    """Map some framesets' keyframes; a session in a map is placed in its frame, the walk's first pose."""
+    """Map the framesets with the given indices as keyframes, in a saved map (``begin``) or a new one.
+
+    The frame of the map is the first pose of the walk. The map is saved to ``keep``, unless it is None.
+    """
     assert source.truth is not None
     truth = load_trajectory(source.truth)
     first_T_world = se3_inverse(np.ascontiguousarray(truth.at(source.stamps_ns[:1], _GAP_S)[0].nav_T_body[0]))

@@ -1,4 +1,4 @@
-"""NEES and NIS of many runs: their means, and the bands of a consistent estimator."""
+"""NEES and NIS of many runs: their means, and the 95 % bands of a consistent estimator."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ CONFIDENCE = 0.95
 
 
 class Squares:
-    """Squared Mahalanobis distances by quantity, run and time."""
+    """A collection of squared Mahalanobis distances by quantity, run and time."""
 
     def __init__(self) -> None:
         self._of: dict[str, dict[int, dict[float, float]]] = defaultdict(lambda: defaultdict(dict))
         self.dimensions: dict[str, int] = {}
 
     def add(self, name: str, run: int, time_s: float, error: Float, covariance: Float) -> None:
-        """Add the squared distance of an error (M,) with its reported covariance (M, M)."""
+        """Add the squared Mahalanobis distance of an error (M,) with the reported covariance (M, M)."""
         self.add_square(name, run, time_s, float(error @ np.linalg.solve(covariance, error)), len(error))
 
     def add_square(self, name: str, run: int, time_s: float, square: float, dimensions: int) -> None:
@@ -31,7 +31,7 @@ class Squares:
         self._of[name][run][round(time_s, 3)] = square
 
     def over_time(self, name: str) -> tuple[Float, Float]:
-        """Return the times (T,) that all runs have, and mean squares (T,) of the runs there."""
+        """Return the times (T,) that all runs have, and the means (T,) over the runs at these times."""
         runs = list(self._of[name].values())
         times = sorted(frozenset.intersection(*(frozenset(run) for run in runs)))
         return np.array(times), np.array([np.mean([run[t] for run in runs]) for t in times])
@@ -82,8 +82,8 @@ def tilt_error(nav_T_body: Float, gravity_nav: Float, true: Float) -> Float:
 
     Args:
         nav_T_body: (4, 4) estimated pose.
-        gravity_nav: (3,) as estimated.
-        true: (4, 4) pose of body in a level frame.
+        gravity_nav: (3,) estimated gravity.
+        true: (4, 4) true pose of body in a level frame.
     """
     level_R_body = level_R_nav(gravity_nav) @ nav_T_body[:3, :3]
     true_up = level_R_body @ true[2, :3]

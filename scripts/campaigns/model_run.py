@@ -1,4 +1,4 @@
-"""One run of the smoother alone, with errors sampled from its own model."""
+"""Runs of the smoother alone, with errors that are sampled from its own model."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from graphvio.measurements.imu_interval import ImuInterval
 
 _WARM_UP_S = 2.0
 _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.02, 0.2, 0.01, 0.2  # the last is the smoother's
-_FIRST_GYRO_BIAS, _FIRST_ACCEL_BIAS = 4e-3, 4e-2  # that the simulator's IMU has
+_FIRST_GYRO_BIAS, _FIRST_ACCEL_BIAS = 4e-3, 4e-2  # of the simulator's IMU
 
 Square = tuple[str, float, float, int]
-"""Quantity, seconds, squared Mahalanobis distance, dimensions."""
+"""Name of the quantity, time in seconds, squared Mahalanobis distance, and its dimensions."""
 
 
 def model_run(seed: int, templates: dict[int, Template], duration_s: float) -> list[Square]:
-    """One run, and its squares at each second."""
+    """Run the smoother once, and return the squared Mahalanobis distances at each second."""
     return list(_ModelRun(seed, templates, duration_s).squares())
 
 
@@ -54,7 +54,7 @@ class _ModelRun:
         self._params = preintegration_params(walk.imu, 1.0)
 
     def squares(self) -> Iterator[Square]:
-        """Go through the run."""
+        """Run the smoother, and yield the squared Mahalanobis distances."""
         smoother = self._smoother
         self._initialise()
         references = {1: 0, 10: 0}  # seconds -> frameset from which the motion is measured
@@ -84,7 +84,7 @@ class _ModelRun:
                     references[seconds] = k
 
     def _initialise(self) -> None:
-        """Initialise at the truth with errors of the initial state."""
+        """Initialise the smoother at the true state plus sampled errors."""
         rng, pose = self._rng, self._truth[0]
         covariance = origin_covariance(pose[:3, :3], _TILT_SIGMA)
         known = InitialUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
@@ -108,7 +108,8 @@ class _ModelRun:
             yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
 
     def _imu_square(self, interval: ImuInterval, k: int) -> float:
-        """Squared distance of the IMU from one frameset to the next, with the walk of its biases, from the truth."""
+        """Return the squared Mahalanobis distance of the IMU factor between two framesets (with the biases' random
+        walk) at the true states."""
         biases = []
         for number in (k - 1, k):
             sample = round(number / FRAMES_HZ * self._imu_rate_hz)

@@ -12,14 +12,14 @@ import numpy as np
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 BEGIN_S = 3.0
-"""Begin of the faults, after the recording's first frameset."""
-_LENGTH_S, _LONGER_S = 12.0, 16.0  # of the recording that is run
+"""Start of the faults, seconds after the recording's first frameset."""
+_LENGTH_S, _LONGER_S = 12.0, 16.0  # lengths of the part of the recording that is run
 _END_OF_VISION_S = 8.0
 _NEVER_S = math.inf
 _MS = 1_000_000
 
 Change = Callable[[Measurement], list[Measurement]]
-"""Returns the measurements that are delivered in place of one."""
+"""A function that returns the measurements that are delivered in place of a measurement."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class Case:
     """One fault, or two at once.
 
     Attributes:
-        name: in the tables.
-        requirement: the required behaviour, for the table.
+        name: name in the tables.
+        requirement: the required behaviour, in words for the table.
         make: returns a new change, which is applied to the measurements from ``begin_s`` on and before ``end_s``.
-        begin_s: seconds after the first frameset; minus infinity for all that comes before it, too.
-        end_s: on the same scale; infinite where it never ends.
-        late_s: framesets are delivered so much later than the IMU's samples of their instant.
-        jump_s: by which the change moves the stamps.
-        length_s: of the recording that is run.
+        begin_s: start in seconds after the first frameset; minus infinity to include all measurements before it, too.
+        end_s: end in seconds after the first frameset; infinite if the fault never ends.
+        late_s: time by which framesets are delivered later than the IMU samples of the same instant.
+        jump_s: time by which the change moves the stamps.
+        length_s: length of the part of the recording that is run.
     """
 
     name: str
@@ -48,20 +48,20 @@ class Case:
 
     @property
     def over_s(self) -> float:
-        """End of the fault, seconds; a jump of the clock has no duration."""
+        """End of the fault, seconds; for a jump of the clock its start, since it has no duration."""
         return self.begin_s if self.jump_s > 0.0 else self.end_s
 
     def true_ns(self, stamp_ns: int, start_ns: int) -> int:
-        """Return the recording's stamp of a delivered stamp, int64 nanoseconds."""
+        """Return the stamp in the recording that belongs to a delivered stamp, nanoseconds."""
         jumped = self.jump_s > 0.0 and (stamp_ns - start_ns) * 1e-9 > self.begin_s + 0.5 * self.jump_s
         return stamp_ns - round(self.jump_s * 1e9) if jumped else stamp_ns
 
 
 class Delivery:
-    """The measurements of a recording as a case delivers them, one by one.
+    """Iterator over the measurements of a recording, as they are delivered in a case.
 
     Attributes:
-        framesets: how many of the recording's were delivered so far, each counted once.
+        framesets: number of the recording's framesets that were delivered so far, each counted once.
     """
 
     def __init__(self, case: Case, measurements: Iterable[Measurement], start_ns: int) -> None:
@@ -108,7 +108,7 @@ def _present(measurement: Measurement | None) -> list[Measurement]:
 
 
 def _black(*pairs: int) -> Callable[[], Change]:
-    """All pairs, or those that are named."""
+    """Return a maker of a change that blackens the images of the given pairs, or of all pairs if none is given."""
 
     def blackened(frameset: FrameSet) -> FrameSet:
         dark = {j: (np.zeros_like(left), np.zeros_like(right)) for j, (left, right) in frameset.images.items()}
@@ -157,7 +157,7 @@ def _not_a_number() -> Change:
 
 
 def _muddled() -> Change:
-    """Every measurement twice, and once with an earlier stamp."""
+    """Return a change that delivers every measurement twice, and once more with an earlier stamp."""
 
     def three(measurement: Measurement) -> list[Measurement]:
         back_ms = 20 if isinstance(measurement, ImuSample) else 200
@@ -177,7 +177,7 @@ def _by_another_clock(late_s: float) -> Callable[[], Change]:
 
 
 def _turned() -> Change:
-    """About body's z by 90 degrees."""
+    """Return a change that turns the IMU's readings by 90 degrees about the z axis of body."""
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return _of_samples(lambda s: ImuSample(s.stamp_ns, turn @ s.angular_velocity, turn @ s.linear_acceleration))
 
@@ -233,4 +233,4 @@ CASES = (
     Case("all clocks jump by 7 s", _NEW_EPOCH, _jumped(7.0), jump_s=7.0),
     Case("all clocks jump by 10 000 s", _NEW_EPOCH, _jumped(10_000.0), jump_s=10_000.0),
 )  # fmt: skip
-"""The first has no fault, as a baseline."""
+"""All cases. The first has no fault, as a baseline."""

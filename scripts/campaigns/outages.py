@@ -1,7 +1,7 @@
-"""``scripts/campaign outages``: the estimate when images or the IMU fail for a while, or for good.
+"""``scripts/campaign outages``: estimates when images or the IMU fail, for a while or for good.
 
-The whole odometry with its defaults runs on the simulated room, once for each case. A table shows the status of the
-estimates meanwhile, how far they jumped, when vision was used again and the error of the motion.
+The whole odometry with its default configuration runs on the simulated room, once for each case. A table shows the
+status of the estimates during the fault, how far they jumped, when vision was used again, and the error of the motion.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "room"
 _BEFORE_S, _AFTER_S = 1.0, 3.0
-_WARM_UP_S = 2.0  # motions are measured from here on at the earliest: at first the tilt is known least
+_WARM_UP_S = 2.0  # errors of motions are measured only after this time, since the tilt is least certain at first
 _MAX_SIGMA = 3.0
-_MAX_STATISTIC = float(chi2.isf(chi2.sf(_MAX_SIGMA**2, 1), 6))  # as improbable of a pose, which has six numbers
+_MAX_STATISTIC = float(chi2.isf(chi2.sf(_MAX_SIGMA**2, 1), 6))  # with the same probability in 6 dimensions
 _BY_VISION = (Status.TRACKING, Status.INITIALISING)
 _HEAD = ("case", "poses, %", "while it lasts", "largest jump, mm", "at return", "recovery, s", "error, cm",
          "epochs", "events")  # fmt: skip
@@ -86,13 +86,13 @@ def main(args: argparse.Namespace) -> None:
 
 
 def run_case(number: int, folder: Path) -> tuple[list[str], list[str]]:
-    """Run one of the cases on a recording; returns its cells of the table, and the requirements that it missed."""
+    """Run one of the cases on a recording; return its cells of the table, and the requirements that it missed."""
     outcome = outcome_of(CASES[number], folder)
     return outcome.cells(), outcome.missed()
 
 
 def outcome_of(case: Case, folder: Path) -> Outcome:
-    """Run a case on a recording."""
+    """Run a case on a recording, and return its outcome."""
     source = open_source(folder, to_s=case.length_s)
     assert source.truth is not None
     truth = load_trajectory(source.truth)
@@ -112,12 +112,12 @@ class Outcome:
     """Result of one case.
 
     Attributes:
-        case: which.
-        estimates: N of them, in the order in which they were reported.
-        times_s: (N,) of the images, seconds of the recording after its first frameset.
+        case: the case.
+        estimates: the N estimates, in the order in which they were reported.
+        times_s: (N,) times of their images, seconds after the first frameset of the recording.
         world_T_body: (N, 4, 4) true poses.
-        given: number of the framesets that were delivered.
-        events: all.
+        given: number of framesets that were delivered.
+        events: all events.
     """
 
     case: Case
@@ -146,7 +146,7 @@ class Outcome:
         ]
 
     def missed(self) -> list[str]:
-        """Return the requirements on every case that this one missed."""
+        """Return those requirements for all cases that this one missed."""
         stamps = [e.stamp_ns for e in self.estimates]
         most = max(self.return_distances(), default=0.0)
         requirements = {
@@ -158,7 +158,7 @@ class Outcome:
         return [words for words, held in requirements.items() if not held]
 
     def return_distances(self) -> list[float]:
-        """Return the Mahalanobis distances of steps from coasting to vision, by the covariance of the pose before."""
+        """Return the Mahalanobis distances of the steps from coasting to vision, by the covariance before each step."""
         distances = []
         for i, (before, after) in enumerate(pairwise(self.estimates)):
             returned = before.status is Status.COASTING and after.status in _BY_VISION
@@ -168,14 +168,14 @@ class Outcome:
         return distances
 
     def recovery_s(self) -> float:
-        """Seconds from the end of the fault until vision is used again; NaN where it does not end."""
+        """Return the time from the end of the fault until vision is used again, seconds; NaN if that never happens."""
         after = self.times_s >= self.case.over_s - 1e-3
         used = [e.status in _BY_VISION and e.nav_T_body is not None for e in self.estimates]
         times_s = self.times_s[after & np.array(used)]
         return float(times_s[0] - self.case.over_s) if len(times_s) else np.nan
 
     def error_m(self) -> float:
-        """Error of the motion from before to after the fault; NaN where there is no pose at its end."""
+        """Return the position error of the motion from before to after the fault; NaN if there is no pose after it."""
         end = int(np.searchsorted(self.times_s, self.case.over_s + _AFTER_S + 1e-3)) - 1
         start_s = max(self.case.begin_s - _BEFORE_S, _WARM_UP_S) - 1e-3
         of_epoch = [e.epoch == self.estimates[end].epoch and e.nav_T_body is not None for e in self.estimates]

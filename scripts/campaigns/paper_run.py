@@ -1,4 +1,4 @@
-"""One walk, measured as the paper's filter measures it, and estimated by filter, windows of its model, and smoother."""
+"""A walk with the measurements of the paper's filter, estimated by it, by windows of its model, and by the smoother."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graphvio.geometry import se3_exp, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion
 
-_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
+_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of visual motions from frame to frame: rad and metres
 _BLIND_EVERY_S, _BLIND_S = 5.0, 1.0
 _TILT_SIGMA, _SPEED_SIGMA, _RATE_SIGMA, _GYRO_BIAS_SIGMA = 0.01, 0.05, 0.1, 0.01
 
@@ -31,10 +31,10 @@ class Track:
     """Errors over a run.
 
     Attributes:
-        position_m: (N, 3).
-        velocity_m_s: (N, 3) in body.
-        tilt_rad: (N, 2) about nav's horizontal axes.
-        heading_rad: (N,).
+        position_m: (N, 3) errors of the position.
+        velocity_m_s: (N, 3) errors of the velocity, in body.
+        tilt_rad: (N, 2) errors of the orientation about nav's horizontal axes.
+        heading_rad: (N,) errors of the orientation about nav's vertical axis.
     """
 
     position_m: Float
@@ -44,7 +44,7 @@ class Track:
 
 
 class PaperRun:
-    """Measurements of a walk, a function of the seed."""
+    """The measurements of a walk, sampled with a seed, and the estimators that process them."""
 
     def __init__(self, seed: int, duration_s: float) -> None:
         rng, walk = np.random.default_rng([seed, 11]), Walk(seed, duration_s)
@@ -67,7 +67,7 @@ class PaperRun:
             )
 
     def by_filter(self) -> dict[str, Track]:
-        """The paper's filter."""
+        """Estimate by the paper's filter; for the result see `by_graph`."""
         running = ExtendedKalmanFilter(*self._start())
         states = []
         for k in range(1, len(self._stamps)):
@@ -77,7 +77,15 @@ class PaperRun:
         return {"newest": self._track(states), "leaving": self._track(states)}
 
     def by_graph(self, lag: int, iterations: int) -> dict[str, Track]:
-        """A window of the filter's model."""
+        """Estimate by a window of the filter's model.
+
+        Args:
+            lag: length of the window in steps.
+            iterations: number of iterations in each step.
+
+        Returns:
+            ``newest`` -> errors of each state when it was the newest; ``leaving`` -> when it left the window.
+        """
         graph = PaperGraph(*self._start(), lag, iterations)
         newest, leaving = [], []
         for k in range(1, len(self._stamps)):
@@ -91,7 +99,7 @@ class PaperRun:
         return {"newest": self._track(newest), "leaving": self._track(leaving)}
 
     def by_smoother(self) -> dict[str, Track]:
-        """The odometry's smoother."""
+        """Estimate by the odometry's smoother; for the result see `by_graph`."""
         smoother, (first, _) = Smoother(SmootherConfig(), self._imu), self._start()
         pose = first.nav_T_body
         known = InitialUncertainty(origin_covariance(pose[:3, :3], _TILT_SIGMA), _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
@@ -135,8 +143,8 @@ class PaperRun:
         return made
 
     def _track(self, states: list[tuple[int, FilterState]], velocities: Float | None = None) -> Track:
-        """Errors of states. Velocities (N + 1, 3) default to the filter's, means over the step that ends in the
-        state."""
+        """Return the errors of states, given as number and state. The true velocities (N + 1, 3) default to those of
+        the filter, which are means over the step that ends in the state."""
         if velocities is None:
             velocities = np.vstack([self._velocities[:1], 0.5 * (self._velocities[1:] + self._velocities[:-1])])
         errors = []
@@ -151,6 +159,6 @@ class PaperRun:
 
 
 def _posed(nav_T_body: Float, velocity_body: Float | None = None) -> FilterState:
-    """A state of which only the pose, and perhaps the velocity, is known."""
+    """Return a filter state from a pose and, if known, a velocity; all else is unknown."""
     velocity = np.full(3, np.nan) if velocity_body is None else velocity_body
     return FilterState(nav_T_body[:3, 3], nav_T_body[:3, :3], velocity, np.zeros(3), np.zeros(3))

@@ -1,4 +1,4 @@
-"""The plot of the consistency campaign: mean squares over time, each with its band."""
+"""The plot of the consistency campaign: mean squared Mahalanobis distances over time, each with its 95 % band."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MIN_TIMES = 3
 
 
 def draw_consistency(path: Path, squares: Squares, names: Mapping[str, str]) -> None:
-    """Plot a panel for each quantity that is known at several times.
+    """Plot one panel for each quantity that has values at several times.
 
     Raises:
         GraphvioError: if the plot cannot be written.

@@ -1,10 +1,10 @@
-"""``scripts/campaign random-rigs``: rigs that nobody chose, with exact and with wrong calibration files.
+"""``scripts/campaign random-rigs``: accuracy with randomly sampled rigs, with exact and with wrong calibration files.
 
-Each rig is sampled: none to three pairs, none to four single cameras, any lens model, field of view, place and
-direction; baselines of 3 to 25 cm, 8 to 40 Hz, pairs triggered together or apart, global or rolling shutters, IMUs with
-up to eight times the usual noise. It walks through one of the simulator's scenes, from a standstill or from the middle
-of its motion on, by its exact calibration and by one that is wrong at level 1, 2 or 3 in turn, and all its poses count,
-those before the calibration is known too.
+Each rig has none to three pairs and none to four single cameras with any lens model, field of view, position and
+direction, baselines of 3 to 25 cm, 8 to 40 Hz, pairs triggered together or apart, global or rolling shutters, and an
+IMU with up to eight times the usual noise. It is carried through one of the simulator's scenes, and the odometry begins
+at a standstill or in the middle of the motion. It runs with the exact calibration and with one that is wrong at level
+1, 2 or 3 in turn. All poses count, including those before the calibration is known.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ _NOTABLE = (
     EventKind.WINDOW_REBUILT,
     EventKind.NOT_INITIALISED,
 )
-"""Wrong with exact files, as nothing fails or jumps here; single cameras may not be initialised for long."""
+"""Events that should not occur with exact files, since nothing fails or jumps here. An exception is that single cameras
+may need a long time to initialise."""
 
 
 _KINDS: dict[str, Callable[[RandomRig], bool]] = {
@@ -64,12 +65,12 @@ class _Result(NamedTuple):
 
     @property
     def ate_percent(self) -> float:
-        """Of the path."""
+        """ATE as a percentage of the path's length."""
         return 100.0 * self.outcome.ate_m / self.path_m
 
     @property
     def cells(self) -> list[str]:
-        """The cells of `_HEAD`."""
+        """The cells of a table's row below `_HEAD`."""
         outcome = self.outcome
         events = [f"{kind} {outcome.events[kind]}" for kind in _NOTABLE if kind in outcome.events]
         return [
@@ -116,7 +117,7 @@ def main(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace, seed: int) -> list[_Result]:
-    """Return the results with exact and with wrong files."""
+    """Run the rig of a seed, and return the results with exact and with wrong files."""
     sampled = sample_rig(seed)
     render = partial(
         simulate,

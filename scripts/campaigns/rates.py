@@ -1,6 +1,6 @@
-"""``scripts/campaign rates``: the paper's figure 5, the rates of a turn without vision.
+"""``scripts/campaign rates``: a plot of the angular rates in a turn without vision, like the paper's figure 5.
 
-The bend of the simulated corridor, where both pairs see nothing but blank walls for a second: images of the left
+It shows the bend of the simulated corridor, where both pairs see only blank walls for a second: images of the left
 cameras, and below them the angular rates in body by gyro, vision and estimate. The estimate follows vision, then the
 gyro, then vision again.
 """
@@ -107,7 +107,7 @@ def _draw_axis(axes: Any, i: int, rates: dict[str, list[tuple[float, Float]]], b
     for name, colour in _COLOURS.items():
         times = np.array([time_s for time_s, _ in rates[name]])
         values = np.rad2deg([rate[i] for _, rate in rates[name]])
-        gaps = np.flatnonzero(np.diff(times) > 0.075) + 1  # vision is silent there: no line across
+        gaps = np.flatnonzero(np.diff(times) > 0.075) + 1  # no line is plotted across gaps without vision
         axes.plot(
             np.insert(times, gaps, np.nan),
             np.insert(values, gaps, np.nan),

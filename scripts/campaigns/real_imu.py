@@ -1,8 +1,8 @@
-"""``scripts/campaign real-imu``: is the smoother consistent with a real IMU?
+"""``scripts/campaign real-imu``: NEES, NIS and biases of the smoother with a real IMU.
 
-EuRoC V1_01 has 145 s of a real IMU and a truth, but no images: vision's motions are sampled around the truth. The truth
-is reconstructed from the file's positions and the IMU, as the file's orientations are not those of the IMU; their
-difference is reported, and its effect.
+The recording, of EuRoC V1_01, has 145 s of a real IMU and a truth, but no images: visual motions are sampled around the
+truth. The truth is reconstructed from the file's positions and the IMU, since the file's orientations are not those of
+the IMU. The difference of these orientations and its effect are reported.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from graphvio.errors import GraphvioError
 from graphvio.rig import Imu
 
 RECORDING = DOCS.parents[1] / "shared" / "data" / "euroc_v101_imu"
-_FACTOR = 2.0  # the aim for NEES and NIS
+_FACTOR = 2.0  # aim: NEES and NIS are within this factor of their expectation
 _GYRO_BIAS_AIM, _AFTER_S = 2e-3, 10
 _OTHER_SCALE = 2.0
 _ALLAN_S = (0.2, 0.5, 1, 2, 5, 10, 20)
 _AXES = "xyz"
-_OWN = ("velocity", "tilt", "gyro bias", "accel bias")  # whose truth has a covariance of its own
+_OWN = ("velocity", "tilt", "gyro bias", "accel bias")  # quantities whose reconstructed truth has a covariance
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -218,7 +218,8 @@ def _write_recorded(report: Report, run: RealRun, by_file: RealRun, recorded: Tr
 
 
 def _squares(runs: list[RealRun], uncertainty: dict[tuple[str, int], Float] | None = None) -> Squares:
-    """Return the squares of all errors, with the truth's own covariances added, by name and number of the state."""
+    """Return the squared Mahalanobis distances of all errors; ``uncertainty`` is name of the quantity and number of the
+    state -> covariance of the truth, which is added to the reported one."""
     squares = Squares()
     for seed, run in enumerate(runs):
         for miss in run.misses:
@@ -228,7 +229,7 @@ def _squares(runs: list[RealRun], uncertainty: dict[tuple[str, int], Float] | No
 
 
 def _uncertainty(found: Reconstruction, runs: list[RealRun]) -> dict[tuple[str, int], Float]:
-    """The reconstruction's covariances: name and number of the state -> (M, M)."""
+    """Return the covariances of the reconstruction: name of the quantity and number of the state -> (M, M)."""
     numbers = sorted({miss.number for miss in runs[0].misses if miss.name == "velocity"})
     own: dict[tuple[str, int], Float] = {}
     for k, known in found.covariances(np.array(numbers)).items():
@@ -245,7 +246,7 @@ def _uncertainty(found: Reconstruction, runs: list[RealRun]) -> dict[tuple[str, 
 
 
 def _scattered(runs: list[RealRun], name: str) -> float:
-    """Mean squared distance from the mean error of all runs, corrected for the number of runs."""
+    """Return the mean squared Mahalanobis distance from the mean error of all runs, corrected for their number."""
     by_number: dict[int, list[Miss]] = defaultdict(list)
     for run in runs:
         for miss in run.misses:
@@ -261,13 +262,13 @@ def _scattered(runs: list[RealRun], name: str) -> float:
 
 
 def _mean(squares: Squares, name: str) -> tuple[str, str, str]:
-    """Cells: dimensions, mean, and mean over dimensions."""
+    """Return cells: the number of dimensions, the mean, and the mean divided by the dimensions."""
     dimensions, mean = squares.dimensions[name], squares.mean(name)
     return str(dimensions), f"{mean:.2f}", f"{mean / dimensions:.2f}"
 
 
 def _apart(found: Float, reference: Float) -> tuple[float, float]:
-    """Median and 95th percentile of the differences of biases (S, N) from others (N,)."""
+    """Return median and 95th percentile of the absolute differences of biases (S, N) from reference values (N,)."""
     away = np.abs(found - reference)
     return float(np.median(away)), float(np.percentile(away, 95.0))
 

@@ -1,4 +1,4 @@
-"""One run of the smoother alone on a recorded IMU, with motions of vision that are sampled around a truth."""
+"""Runs of the smoother alone on a recorded IMU, with visual motions that are sampled around a truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 _WARM_UP_S = 2.0
-_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
+_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of visual motions from frame to frame: rad and metres
 _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA = 0.05, 0.2, 0.1
 _INTERVALS_S = (1, 10)
 
@@ -28,10 +28,10 @@ class Miss:
     """Error of an estimate, and its reported covariance.
 
     Attributes:
-        name: of the quantity.
-        number: of the state.
-        error: (M,) truth less estimate.
-        covariance: (M, M) as reported.
+        name: name of the quantity.
+        number: number of the state.
+        error: (M,) truth minus estimate.
+        covariance: (M, M) reported covariance.
     """
 
     name: str
@@ -45,10 +45,10 @@ class RealRun:
     """Result of a run.
 
     Attributes:
-        misses: of the states at each second, of motions and of vision's innovations.
-        gyro_biases: (N, 3) rad/s, of each state.
-        accel_biases: (N, 3) m/s^2.
-        refused: how many motions of vision.
+        misses: errors of the states at each second, errors of motions, and vision's innovations.
+        gyro_biases: (N, 3) rad/s, estimated for each state.
+        accel_biases: (N, 3) m/s^2, estimated for each state.
+        refused: number of visual motions that the gate refused.
     """
 
     misses: list[Miss]
@@ -58,7 +58,7 @@ class RealRun:
 
 
 def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu) -> RealRun:
-    """Go through a flight, with vision sampled around a truth; the biases are zero at the start."""
+    """Run the smoother on a flight, with vision sampled around a truth; the estimated biases are zero at first."""
     rng = np.random.default_rng([seed, 11])
     smoother = _initialised(flight, truth, config, imu, rng)
     misses: list[Miss] = []
@@ -92,7 +92,7 @@ def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, im
 
 
 def _initialised(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu, rng: np.random.Generator) -> Smoother:
-    """Return a smoother at the truth with errors of the initial state."""
+    """Return a smoother that is initialised at the true state plus sampled errors."""
     pose = np.ascontiguousarray(truth.world_T_body[0])
     covariance = origin_covariance(pose[:3, :3], _TILT_SIGMA)
     off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
@@ -107,7 +107,7 @@ def _initialised(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu,
 
 
 def _measured_motion(flight: Flight, truth: Truth, k: int, rng: np.random.Generator) -> RelativeMotion:
-    """Sample a measurement of the motion between two frames."""
+    """Sample a visual measurement of the motion from frame ``k - 1`` to frame ``k``."""
     moved = _moved(truth, k - 1, k) @ se3_exp(_SIGMAS * rng.standard_normal(6))
     stamps = flight.stamps_ns
     return RelativeMotion(stamps[k - 1], stamps[k], moved, np.diag(_SIGMAS**2), np.zeros((6, 6)), 100)
@@ -133,6 +133,6 @@ def _motion_error(smoother: Smoother, flight: Flight, truth: Truth, start: int, 
 
 
 def _moved(truth: Truth, start: int, end: int) -> Float:
-    """True ``start_T_end`` (4, 4) of body."""
+    """Return the true motion ``start_T_end`` (4, 4) of body."""
     poses = truth.world_T_body
     return np.asarray(se3_inverse(np.ascontiguousarray(poses[start])) @ poses[end])

@@ -1,4 +1,4 @@
-"""One run of the whole odometry on rendered images, with a newly sampled IMU."""
+"""Runs of the whole odometry on rendered images, each with newly sampled IMU readings."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from graphvio.simulation.motion import MotionStates
 from graphvio.sources import open_source
 
 SHARED_ERROR_SHARE = MotionConfig().shared_error_share
-"""Stands for errors of tracking that motions have in common; the simulator's calibration has none."""
+"""Share for errors of tracking that the points of a motion have in common; the simulator's calibration has no error."""
 WITHOUT_SHARE = ", share 0"
 _WARM_UP_S = 2.0
-_WINDOW_S = {1: 1.0, 10: 10.0}  # lag that still has the state from which the motion is measured
+_WINDOW_S = {1: 1.0, 10: 10.0}  # duration of a motion -> lag with which the state at its start is still in the window
 
 
 def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[Square]:
-    """One run, and its squares at each second."""
+    """Run the odometry once with each setting, and return the squared Mahalanobis distances at each second."""
     source = open_source(simulated(data, scene), to_s=duration_s)
     assert source.rig.imu is not None
     motion = build_scene(scene).motion
@@ -65,7 +65,7 @@ class _Run:
         self._start_ns, self._odometry, self._track, self._states = start_ns, odometry, track, states
 
     def squares(self, measurements: list[Measurement], seconds: int) -> Iterator[Square]:
-        """Yield the squares of motions over so many seconds and, with one second, of the states."""
+        """Yield the squared Mahalanobis distances of motions over ``seconds`` and, if it is 1, of states and vision."""
         for measurement in measurements:
             estimate = self._odometry.process(measurement)
             if estimate is None:
@@ -105,7 +105,7 @@ class _Run:
         estimator = self._odometry._estimator
         assert isinstance(estimator, SmootherEstimator)
         then_ns = estimate.stamp_ns - seconds * 1_000_000_000
-        estimator._running.optimize()  # that state was not kept
+        estimator._running.optimize()  # the state at the motion's start was not passed as one to keep
         now_T_then = estimator.motion_since(then_ns)
         if now_T_then is None:
             return

@@ -1,7 +1,8 @@
-"""``scripts/campaign self-calibration``: errors of the calibration before and after a walk, against their covariance.
+"""``scripts/campaign self-calibration``: errors of the calibration before and after a walk, and their covariance.
 
-Each run samples a wrong calibration file and walks through a cloud of points, without images: its tracks have white
-noise, and no outliers. IMUs have the time offset and the white noise of the level; their scale is exact.
+Each run samples a wrong calibration file and a walk through a cloud of points, without images: the tracks have white
+noise and no outliers. The IMU has the time offset and the white noise of the level of calibration error; its scale is
+exact.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ _OF_CAMERA = np.concatenate([_CAMERAS[:, :CAMERA], _CAMERAS[:, CAMERA:STEREO]])
 
 class _Group(NamedTuple):
     name: str
-    rows: Float  # (n, C), whose products with the parameters are looked at
-    scale: float  # to the unit of the name
+    rows: Float  # (n, C) matrix; its product with the C parameters are the quantities of the group
+    scale: float  # factor to the unit in the name
 
 
 class _Run(NamedTuple):
     before: dict[str, Float]
     after: dict[str, Float]
-    nees: dict[str, float]  # of each dimension
+    nees: dict[str, float]  # NEES per dimension
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -81,7 +82,7 @@ def main(args: argparse.Namespace) -> None:
 
 
 def _one_run(seed: int, level: int, duration_s: float) -> _Run:
-    """Let a calibration see a walk, and compare what it found with the truth."""
+    """Estimate a calibration from a walk, and compare it with the truth."""
     sampled = draw(default_rig(), CalibrationErrorSizes.of_level(level, list(_COMPONENTS)), seed)
     written, true = sampled.written_rig, sampled.true_rig
     found = calibrated(SelfCalibration(written), Walk(true, seed=seed), duration_s).estimate

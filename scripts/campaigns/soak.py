@@ -1,7 +1,8 @@
-"""``scripts/campaign soak``: do memory and speed of the live system stay constant over thousands of framesets?
+"""``scripts/campaign soak``: memory and speed of the live system over thousands of framesets, which should be constant.
 
-The whole live system, from the source to the listeners, on the simulated room that is walked to and fro. Memory is that
-of the process. With ``--services``, it is recorded and served by gRPC and ROS 2, and a client takes all keyframes.
+The whole live system, from the source to the listeners, runs on the simulated room, which is walked to and fro. The
+memory of the process is reported. With ``--services``, the run is recorded and served by gRPC and ROS 2, and a client
+receives all keyframes.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ def main(args: argparse.Namespace) -> None:
 def _soak(
     folder: Path, framesets: int, is_real_time: bool, target: Path | None
 ) -> tuple[list[list[str]], _Figures, float, str]:
-    """Rows by tenths, the figures at the end, the growth of memory (MB), and the services' summary if there are any."""
+    """Run the live system; return a row for each tenth of the run, the figures at the end, the growth of memory (MB),
+    and the services' summary, "" without services."""
     share_heap()  # as the command line does
     config = Config()
     if target is not None:
@@ -105,7 +107,7 @@ def _soak(
     figures |= {f"work_p{percent}_ms": float(np.percentile(listener.work_ms, percent)) for percent in (50, 99)}
     rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
     memories.append(float(figures["memory_mb"] or np.nan))
-    warm = 2 if services is not None else 0  # keyframes are kept up to 256 MB, which takes a while to fill
+    warm = 2 if services is not None else 0  # parts until the store of keyframes, up to 256 MB, is full
     return rows, figures, max(memories[warm:]) - memories[warm], summary
 
 

@@ -1,4 +1,4 @@
-"""Motions with errors sampled from the covariances that the front-end reports on images."""
+"""Synthetic visual motions, with errors that are sampled from the covariances of the front-end on images."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Template:
     """The reference and covariance of a motion that the front-end measured.
 
     Attributes:
-        reference: number of the frameset that it is measured from.
-        covariance: (6, 6), tangent in the body frame at its end.
-        shared: (6, 6) the part of it that all motions from that frameset have in common.
+        reference: number of the frameset from which the motion is measured.
+        covariance: (6, 6) covariance of the motion, a tangent in the body frame at its end.
+        shared: (6, 6) part of the covariance that all motions from that frameset have in common.
     """
 
     reference: int
@@ -52,13 +52,13 @@ def templates_of(data: Path, scene: str) -> dict[int, Template]:
 
 
 class SyntheticVision:
-    """Motions with errors of their own and, for each reference, one that they share.
+    """Source of motions with independent errors, and one error for each reference that its motions share.
 
     Args:
-        templates: number of a frameset -> its motion's covariances and reference.
+        templates: number of a frameset -> covariances and reference of the motion that ends there.
         nav_T_body: (N, 4, 4) true poses at the framesets.
-        stamps_ns: (N,) of these.
-        rng: source of the errors.
+        stamps_ns: (N,) stamps of the framesets.
+        rng: random generator of the errors.
     """
 
     def __init__(
@@ -68,14 +68,14 @@ class SyntheticVision:
         self._truth = nav_T_body
         self._stamps_ns = stamps_ns
         self._rng = rng
-        self._shared: dict[int, tuple[Float, Float]] = {}  # reference -> covariance there, and the error
+        self._shared: dict[int, tuple[Float, Float]] = {}  # reference -> shared covariance, and the sampled error
 
     def reference(self, number: int) -> int | None:
-        """Return the number of the frameset that the motion at a frameset is measured from, if there is one."""
+        """Return the number of the frameset from which the motion to a frameset is measured; None without a motion."""
         return self._templates[number].reference if number in self._templates else None
 
     def at(self, number: int) -> RelativeMotion | None:
-        """Return the motion that ends at a frameset, if there is one."""
+        """Return the motion that ends at a frameset, or None if there is none."""
         template = self._templates.get(number)
         if template is None:
             return None

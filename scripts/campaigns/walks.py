@@ -1,4 +1,4 @@
-"""Walks of the simulator's scenes, with an IMU of their own for each seed."""
+"""Walks of the simulator's scenes, with IMU readings that are sampled for each seed."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ FRAMES_HZ = 20
 
 
 class Walk:
-    """A walk's truth and the measurements of an IMU on it.
+    """The truth of a walk, and the measurements of an IMU on it.
 
     Args:
-        seed: of the IMU; the scenes take turns.
-        duration_s: of the walk.
+        seed: seed of the IMU's errors; consecutive seeds use different scenes in turn.
+        duration_s: duration of the walk.
 
     Attributes:
-        imu: the IMU's model.
-        track: its samples with their biases.
-        stamps_ns: (N,) of the framesets.
-        world_T_body: (N, 4, 4) at the framesets.
-        velocity_world: (N, 3) there, m/s.
-        angular_velocity: (N, 3) there, rad/s of body.
+        imu: model of the IMU.
+        track: samples of the IMU, with their biases.
+        stamps_ns: (N,) stamps of the framesets.
+        world_T_body: (N, 4, 4) true poses at the framesets.
+        velocity_world: (N, 3) true velocities at the framesets, m/s.
+        angular_velocity: (N, 3) true angular velocities of body at the framesets, rad/s.
     """
 
     def __init__(self, seed: int, duration_s: float) -> None:
@@ -42,7 +42,7 @@ class Walk:
 
 
 def buffer_of(track: ImuTrack) -> ImuBuffer:
-    """The samples as the back-end holds them."""
+    """Return the samples in a buffer, as the back-end uses them."""
     buffer = ImuBuffer(50.0)
     for stamp, rate, force in zip(
         track.stamps_ns.tolist(), track.angular_velocity, track.linear_acceleration, strict=True

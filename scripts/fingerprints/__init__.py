@@ -1,1 +1,1 @@
-"""Digests of numerical results, to be compared before and after a change: ``scripts/fingerprint``."""
+"""``scripts/fingerprint``: digests of numerical results, to compare them before and after a change of the code."""

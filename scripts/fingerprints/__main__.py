@@ -17,7 +17,7 @@ them has changed no number. Names of kinds of events count in the lines that end
 
 
 def main() -> int:
-    """Run what is asked for, and report what differs from a file."""
+    """Run the selected cases, print their digests, and report the lines that differ from a file."""
     parser = argparse.ArgumentParser(prog="scripts/fingerprint", description=_DESCRIPTION)
     parser.add_argument("--write", type=Path, metavar="FILE", help="also write the lines to this file")
     parser.add_argument("--compare", type=Path, metavar="FILE", help="exit code 1 if a digest is not as in this file")
@@ -46,7 +46,7 @@ def _text(name: str, digest: str, figure: str) -> str:
 
 
 def _lines(chosen: list[str], recordings: Path, jobs: int) -> Iterator[Line]:
-    """Yield lines in the order of the cases; the last one takes longest, and is begun first."""
+    """Yield the lines in the order of the cases. The last case is run first, since it takes longest."""
     recordings.mkdir(parents=True, exist_ok=True)
     scenes = [scene for scene in SCENES if any(name.split("/")[1] == scene for name in chosen)]
     with ThreadPoolExecutor(jobs) as pool:
@@ -57,7 +57,10 @@ def _lines(chosen: list[str], recordings: Path, jobs: int) -> Iterator[Line]:
 
 
 def _is_equal(found: list[Line], path: Path, is_whole: bool) -> bool:
-    """Name the lines that differ from a file's; those that only the file has count where all cases were run."""
+    """Return whether the digests equal those of a file, and print the lines that differ.
+
+    Lines that only the file has count as different if all cases were run (``is_whole``).
+    """
     before = {fields[0]: fields[1] for line in path.read_text().splitlines() if (fields := line.split())}
     now = {name: digest for name, digest, _ in found}
     names = [*now, *(name for name in before if is_whole and name not in now)]

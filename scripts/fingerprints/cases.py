@@ -1,4 +1,4 @@
-"""What is run, and the lines that each run gives: name, digest, and a figure for people."""
+"""The cases that are run, and the lines that each gives: name, digest, and a figure for human readers."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from fingerprints.digests import joined, of_archives, of_files, of_session, of_t
 SCENES = ("room", "corridor", "calibration")
 _CLIP = Path(__file__).parents[3] / "shared" / "data" / "euroc_mh01_clip"
 _SECONDS = "20"
-_EXIT_CODES = (0, 3)  # 3 means that a result is incomplete
+_EXIT_CODES = (0, 3)  # accepted ones; 3 means that a result is incomplete
 
 Line = tuple[str, str, str]
 Case = Callable[[Path, Path], list[Line]]
-"""Takes a recording and an empty folder."""
+"""A function that runs a case: its arguments are a recording and an empty folder, its result the lines."""
 
 
 def cases() -> dict[str, Case]:
-    """Name all of them: what is run, on which recording, and how."""
+    """Return all cases by name: command, recording and, for the odometry, profile and sensors, separated by slashes."""
     recordings = ("euroc", *SCENES)
     found: dict[str, Case] = {
         f"odometry/{recording}/{profile}/{sensors}": partial(_odometry, ["--config", profile, *options])
@@ -38,7 +38,7 @@ def cases() -> dict[str, Case]:
 
 
 def lines_of(name: str, recordings: Path) -> list[Line]:
-    """Run a case; one that fails, or whose recording is not there, has a line that says so."""
+    """Run a case and return its lines; if it fails or its recording is missing, a line that says so."""
     scene = name.split("/")[1]
     recording = _CLIP if scene == "euroc" else recordings / scene
     if not recording.is_dir():
@@ -52,10 +52,10 @@ def lines_of(name: str, recordings: Path) -> list[Line]:
 
 
 def render(scene: str, recordings: Path) -> Line:
-    """Digest a scene's recording, which is rendered if it is missing.
+    """Return the line with the digest of a scene's recording, which is rendered if it is missing.
 
     Raises:
-        RuntimeError: if it cannot be rendered.
+        RuntimeError: if the scene cannot be rendered.
     """
     folder = recordings / scene
     if not folder.is_dir():
@@ -67,7 +67,7 @@ def render(scene: str, recordings: Path) -> Line:
 
 
 def _graphvio(*arguments: str | Path) -> str:
-    """Run a command; gives what it prints."""
+    """Run a graphvio command and return its standard output."""
     command = [Path(sys.executable).with_name("graphvio"), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in _EXIT_CODES:
@@ -82,7 +82,7 @@ def _run(recording: Path, scratch: Path) -> list[Line]:
 
 
 def _odometry(options: list[str], recording: Path, scratch: Path) -> list[Line]:
-    """The same by way of an optimisation without loop closures, which keeps all digits of the odometry's results."""
+    """Run the odometry in an optimisation without loop closures, which stores its results with all digits."""
     out = scratch / "out"
     _graphvio("optimize", recording, "--no-loops", "--out", out, "--to", _SECONDS, *options)
     return _optimized(out)
@@ -106,7 +106,7 @@ def _optimize(recording: Path, scratch: Path) -> list[Line]:
 
 
 def _optimized(out: Path) -> list[Line]:
-    """What an optimisation left: the odometry's results with all digits, its tables, and the solution."""
+    """Return the lines of an optimisation's results: the odometry's states with all digits, tables, the solution."""
     (odometry,) = out.glob("*/odometry")
     archives = list(out.rglob("*.npz"))
     solution = [path for path in out.iterdir() if path.suffix in (".txt", ".csv", ".g2o")]
@@ -118,7 +118,7 @@ def _optimized(out: Path) -> list[Line]:
 
 
 def _tables(odometry: Path) -> list[Line]:
-    """What a run left: nine decimals of poses, ten digits of anything else."""
+    """Return the lines of the odometry's tables, which have nine decimals of poses and ten digits of all else."""
     tables = [*odometry.glob("*.txt"), *odometry.glob("*.csv")]
     summary = json.loads((odometry / "summary.json").read_text())
     error = (summary.get("evaluation") or {}).get("ate_position_m", {})

@@ -26,8 +26,8 @@ def build_scene(name: str, duration_s: float | None = None, stationary_s: float 
 
     Args:
         name: one of `SCENE_NAMES`.
-        duration_s: of the motion; None for the whole walk. After its end the body is stationary.
-        stationary_s: initial standstill; 0 begins at walking speed, as what flies always does.
+        duration_s: duration of the motion; None for the whole walk. After the end of a walk the body is stationary.
+        stationary_s: initial standstill; with 0 the motion begins at walking speed. A flight always begins at speed.
 
     Raises:
         SourceError: if there is no such scene, or the duration is not positive.

@@ -1,7 +1,7 @@
-"""Corridors of an office building: a door, a crowd, a blank-walled bend and a segment where the lamps fail.
+"""Scene ``corridor``: an office building with a door, a crowd, a blank-walled bend and a segment of dimmed lamps.
 
 The walk goes along +x through a door (leg A), a lobby full of people, and into a bend (leg B, to the left and
-right again) where walls, floor and ceiling are blank; then along +x where the lamps fail (leg C), and at last
+right again) where walls, floor and ceiling are blank; then along +x where the lamps are dimmed (leg C), and at last
 to the left along +y (leg D).
 """
 
@@ -31,13 +31,13 @@ _D_X = 50.0  # middle of leg D
 _END_Y = 27.0
 _PATH = [(_START_X, 0.0), (_BEND_X, 0.0), (_BEND_X, _C_Y), (_D_X, _C_Y), (_D_X, _END_Y - 2.0)]
 
-_BLIND_S = (-0.3, 1.0)  # about the middle of the bend: when neither pair sees texture
+_BLIND_S = (-0.3, 1.0)  # relative to the middle of the bend: when neither pair sees texture
 _DIM_LIGHT = 0.12
-_DIM_S = (6.0, 10.0)  # after the bend: when the lamps go down and come back
+_DIM_S = (6.0, 10.0)  # after the middle of the bend: when the lamps go down and come back
 
 
 def build(duration_s: float, stationary_s: float) -> Scene:
-    """Build a walk of 76 m; with the default standstill all hard moments lie within 40 s."""
+    """Build a walk of 76 m; with the default standstill all difficult moments lie within the first 40 s."""
     world = World(ambient=0.42)
     walk = Walk(np.array([(x, y, _BODY_Z_M) for x, y in _PATH]), _SPEED_MPS, duration_s, stationary_s)
     _leg_a(world)
@@ -150,7 +150,7 @@ def _light(world: World) -> None:
 
 
 def _door(world: World, walk: Walk) -> tuple[float, float]:
-    """Add a wall whose door opens as the walker comes; returns when it begins and ends to move, in seconds."""
+    """Add a wall whose door opens as the walker comes; returns the times when it begins and stops moving, seconds."""
     width = 1.2
     side = _HALF_M - 0.5 * width
     for sign in (-1.0, 1.0):
@@ -168,7 +168,7 @@ def _door(world: World, walk: Walk) -> tuple[float, float]:
 
 
 def _crowd(world: World, walk: Walk) -> None:
-    """Add people who cross the lobby, each just before or just behind the walker."""
+    """Add people who cross the lobby, each shortly ahead of or behind the walker."""
     reach, pace = 2.3, 1.15
     for number in range(11):
         x = _LOBBY_X[0] + 0.7 + 0.76 * number
@@ -179,7 +179,7 @@ def _crowd(world: World, walk: Walk) -> None:
 
 
 def _pacing(x: float, crossing_s: float, reach: float, pace: float) -> Callable[[float], tuple[float, float, float]]:
-    """Return a track back and forth across the lobby at one x, through its middle at a given time."""
+    """Return a track back and forth across the lobby at one x, which crosses the lobby's middle at a given time."""
 
     def track(time_s: float) -> tuple[float, float, float]:
         phase = pace / reach * (time_s - crossing_s)
@@ -190,7 +190,7 @@ def _pacing(x: float, crossing_s: float, reach: float, pace: float) -> Callable[
 
 
 def _dimmed(dim: tuple[float, float]) -> Callable[[float], Exposure]:
-    """Return the exposure of lamps that are dimmed for a while, of which the automatic gain compensates a part."""
+    """Return the exposure of lamps that are dimmed for a while; the automatic gain compensates a part of it."""
 
     def exposure(time_s: float) -> Exposure:
         down = _eased((time_s - dim[0]) / 0.6) - _eased((time_s - dim[1]) / 0.6)

@@ -1,4 +1,4 @@
-"""A flight over fields with trees, houses and cars on the roads between them; it begins in the air."""
+"""Scene ``flight``: over fields with trees and houses, and cars on the roads between them; it begins in the air."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _SPEEDS = ((0.0, 0.0), (4.0, 8.0), (38.0, 8.0), (42.0, 0.0))
 _HEADINGS = ((4.0, 0.0), (9.0, -15.0), (16.0, 40.0), (21.0, 45.0), (27.0, -20.0), (34.0, 30.0))
 _CENTRE = np.array([120.0, 30.0])
 _PLOT_M, _ROAD_M = 60.0, 5.0
-_PLOTS, _BUILT_PLOTS = 8, (4, 3)  # fields along x and y to each side of the centre, and those with houses and trees
+_PLOTS, _BUILT_PLOTS = 8, (4, 3)  # fields to each side of the centre, and those along x and y with houses and trees
 
 
 def build(duration_s: float, stationary_s: float) -> Scene:
-    """Build a flight of 240 m in 30 s at 50 m, from the beginning at 8 m/s: a standstill is not a part of it."""
+    """Build a flight of 240 m in 30 s at a height of 50 m, at 8 m/s from the beginning; ``stationary_s`` is ignored."""
     ride = Ride(_SPEEDS, _HEADINGS, _DRONE)
     world = World(ambient=0.8)
     rng = np.random.default_rng(8)

@@ -1,4 +1,4 @@
-"""Furniture, pictures, doors and people."""
+"""Furniture, pictures, doors and people for indoor scenes."""
 
 from __future__ import annotations
 
@@ -89,11 +89,11 @@ def door_leaf(
     """Add a door that turns about a vertical hinge.
 
     Args:
-        world: to add it to.
+        world: world to which it is added.
         hinge: (x, y), metres.
-        width: metres.
-        closed_yaw: direction from the hinge to the lock when closed, rad.
-        angle: returns how far it is open at a time in seconds, rad.
+        width: width of the door, metres.
+        closed_yaw: direction from the hinge to the lock when the door is closed, rad.
+        angle: returns how far the door is open at a time in seconds, rad.
     """
     faces = box_faces((0.045, width, 2.08), "wood", front="door")
     shifted = tuple(replace(face, origin=face.origin + np.array([0.0, 0.5 * width, 0.0])) for face in faces)
@@ -109,7 +109,7 @@ def person(world: World, track: Callable[[float], tuple[float, float, float]], n
     """Add a person.
 
     Args:
-        world: to add it to.
+        world: world to which the person is added.
         track: returns (x, y, yaw) at a time in seconds, metres and radians.
         number: selects clothes and height.
     """

@@ -1,9 +1,9 @@
-"""Office corridors around a closed rectangle, walked once around, on through the first place, and some way back.
+"""Scene ``loop``: office corridors around a closed rectangle, walked around once, then a little farther, and back.
 
-The walk begins in the middle of the south leg and goes along +x, counterclockwise as seen from above, through its first
-place again into a lobby; there it turns and comes back past the first place. All legs have doors of the same kind, each
-with a notice board next to it, and walls of the same four kinds: many places look alike, but for their pictures, floors
-and furniture.
+The walk begins in the middle of the south leg and goes along +x, counterclockwise as seen from above, past the starting
+point again into a lobby; there it turns and comes back past the starting point. All legs have doors of the same kind,
+each with a notice board next to it, and walls of the same three kinds, so that many places differ only in their
+pictures, floors and furniture.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NORTH_Y = 11.0
 _LOBBY_X = (2.5, 8.5)
 _LOBBY_Y = -3.5
 _ROUND = [(0.0, 0.0), (_EAST_X, 0.0), (_EAST_X, _NORTH_Y), (-_EAST_X, _NORTH_Y), (-_EAST_X, 0.0), (0.0, 0.0)]
-_TURN = [(6.4, 0.0), (6.1, -1.5), (2.8, 0.0)]  # in the lobby: on the spot it would be a hard turn
+_TURN = [(6.4, 0.0), (6.1, -1.5), (2.8, 0.0)]  # a wide turn in the lobby; one on the spot would be too sharp
 _BACK_X = -2.0
 _ROUND_M = 4.0 * _EAST_X + 2.0 * _NORTH_Y
 
@@ -33,7 +33,7 @@ _BOARD_M = 0.8
 
 
 def build(duration_s: float, stationary_s: float) -> Scene:
-    """Build a walk of 82 m: the round of 66 m, 6 m more, the turn, and back to 2 m before the first place."""
+    """Build a walk of 82 m: the round of 66 m, 6 m more, the turn, and back to 2 m before the starting point."""
     world = World(ambient=0.42)
     _walls(world)
     _floors(world)
@@ -45,7 +45,7 @@ def build(duration_s: float, stationary_s: float) -> Scene:
     events = {
         "again": (walk.time_at(_ROUND_M), walk.time_at(corner_at[-4])),
         "turn": (walk.time_at(corner_at[-4] - 1.0), walk.time_at(corner_at[-3] + 1.0)),
-        "back": (walk.time_at(corner_at[-2]), walk.time_at(corner_at[-1] - 0.01)),  # beyond its end time has no bound
+        "back": (walk.time_at(corner_at[-2]), walk.time_at(corner_at[-1] - 0.01)),  # at the end the time is not unique
     }
     return Scene("loop", world, walk.motion, events=events)
 
@@ -54,7 +54,7 @@ def _walls(world: World) -> None:
     inside, outside = _EAST_X - _HALF_M, _EAST_X + _HALF_M
     low, high = _NORTH_Y - _HALF_M, _NORTH_Y + _HALF_M
     w, (x1, x2) = _HALF_M, _LOBBY_X
-    # From left to right as seen; the legs to the east and west look most alike.
+    # Each wall from left to right, as seen from the corridor; the legs to the east and west look most alike.
     _wall(world, (-inside, w), (inside, w), ("plaster", "brick", "plaster", "concrete"), first=0)
     _wall(world, (inside, w), (inside, low), ("brick", "plaster"), first=3)
     _wall(world, (inside, low), (-inside, low), ("concrete", "plaster", "brick", "plaster"), first=6)

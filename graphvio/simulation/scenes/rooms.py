@@ -1,4 +1,4 @@
-"""Single rooms: one furnished, walked in two rounds, and one full of texture in which the rig is turned by hand."""
+"""Scenes ``room``, two rounds in a furnished room, and ``calibration``, a textured room with strong rotations."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _HEIGHT_M = 3.0
 _BODY_Z_M = 1.45
 _SPEED_MPS = 1.05  # so that two rounds and a moment of standstill fill 40 s
 _CALIBRATION_HALF_M = 3.2
-_START_S = 1.5  # time to come to full motion
+_START_S = 1.5  # time from standstill to full motion
 
 
 def build_room(duration_s: float, stationary_s: float) -> Scene:
-    """Build a furnished room of 10 x 8 x 3 metres: two rounds about the table, which end where they began."""
+    """Build a furnished room of 10 x 8 x 3 metres, with two rounds about the table that end where they began."""
     world = World(ambient=0.42)
     outline = [(-5.0, -4.0), (-5.0, 4.0), (5.0, 4.0), (5.0, -4.0)]
     world.outline(outline, 0.0, _HEIGHT_M, ("brick", "plaster", "plaster", "concrete"))
@@ -63,7 +63,7 @@ def _furnish(world: World) -> None:
 
 
 def build_calibration(duration_s: float, stationary_s: float) -> Scene:
-    """Build a slow circle in a small room, turned by up to 30 degrees in pitch and roll, and all around in yaw."""
+    """Build a slow circle in a small room, with up to 30 degrees of pitch and roll, and full turns of yaw."""
     world = World(ambient=0.42)
     h = _CALIBRATION_HALF_M
     outline = [(-h, -h), (-h, h), (h, h), (h, -h)]
@@ -86,7 +86,7 @@ def build_calibration(duration_s: float, stationary_s: float) -> Scene:
     def course(times: Float) -> Float:
         """See `Motion`."""
         t = np.clip(times - (stationary_s if stationary_s > 0.0 else -_START_S), 0.0, None)
-        # Motion time runs up smoothly, so that the body is truly stationary at first.
+        # The time of the motion is warped so that it begins smoothly, from a true standstill.
         r = np.minimum(t / _START_S, 1.0)
         t = np.where(r < 1.0, _START_S * (r**4 * (2.5 - 3.0 * r + r * r)), t - 0.5 * _START_S)
         around = 0.45 * t

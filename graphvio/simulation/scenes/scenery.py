@@ -1,4 +1,4 @@
-"""What stands outdoors: hills under a sky, houses, trees and cars."""
+"""Scenery for outdoor scenes: hills under a sky, houses, trees and cars."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def hills_and_sky(world: World, centre: tuple[float, float], ground: str) -> Non
     """Add a plain with hills at its border, 900 m from the centre, and the sky behind them."""
     rng = np.random.default_rng(11)
     x, y = centre
-    for k in range(8):  # the texture has no seam: scaled to each side, it goes on in the next
+    for k in range(8):  # the texture is seamless: scaled to each side, it continues on the next one
         a, b = (np.array([*_on_circle(centre, _SKY_M, i / 8), _LID_M]) for i in (k, k + 1))
         world.rectangles.append(Rectangle(a, b - a, np.array([0.0, 0.0, -_LID_M]), "sky", fit=True))
     world.ceiling((x - _SKY_M, x + _SKY_M), (y - _SKY_M, y + _SKY_M), _LID_M, "sky")
@@ -31,13 +31,13 @@ def hills_and_sky(world: World, centre: tuple[float, float], ground: str) -> Non
 
 
 def _on_circle(centre: tuple[float, float], radius: float, part: float) -> tuple[float, float]:
-    """Return a point of a circle, clockwise by a part of it: walls along it are seen from within."""
+    """Return the point of a circle at a fraction of a turn, clockwise, so that walls along it are seen from inside."""
     angle = -2.0 * np.pi * part
     return centre[0] + radius * float(np.cos(angle)), centre[1] + radius * float(np.sin(angle))
 
 
 def house(world: World, place: Float, size: Sequence[float], yaw: float, walls: str, tint: float) -> None:
-    """Add a house with a flat roof, whose eaves stand out, by the centre (2,) of its ground and its size."""
+    """Add a house with a flat roof that projects over the walls, at a place (2,), the centre of its ground."""
     length, depth, height = size
     x, y = place.tolist()
     roof_tint = 2.5 - 1.6 * tint  # dark on bright walls

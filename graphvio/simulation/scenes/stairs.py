@@ -1,4 +1,4 @@
-"""A stairwell: along a hall, up a flight, about a landing, up another and along the upper floor."""
+"""Scene ``stairs``: along a hall, up a flight of stairs, over a landing, up another and along the upper floor."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _TOP_M = 6.0
 
 
 def build(duration_s: float, stationary_s: float) -> Scene:
-    """Build a hall and a first flight along x, and a second flight and an upper floor along y."""
+    """Build a hall and a first flight of stairs along x, and a second flight and an upper floor along y."""
     world = World(ambient=0.42)
     x_top = _FIRST_STEPS * _TREAD_M
     landing = _FIRST_STEPS * _RISE_M

@@ -1,6 +1,6 @@
-"""A street with turns, by car: houses on both sides, trees, parked cars, and hills far away.
+"""Scene ``street``: a ride by car along a street with turns, houses, trees, parked cars, and hills far away.
 
-What stands along the street has a place by its distance along the route and to the side of it.
+Objects along the street are placed by their distance along the route and to the side of it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _SPEEDS = (
     (22.5, 10.5), (30.0, 10.5), (34.0, 0.0),
 )  # fmt: skip
 _HEADINGS = ((8.0, 0.0), (12.0, 90.0), (17.0, 90.0), (21.0, 0.0), (24.0, 0.0), (26.5, 35.0))
-_BEYOND_M = (60.0, 150.0)  # how far the street goes on before and after the route
+_BEYOND_M = (60.0, 150.0)  # how far the street extends before and after the route
 _STEP_M = 2.0
 _HOUSES_M = (10.0, 16.0)  # from the route to the facades
-_KERB_M = (4.6, 7.0)  # to parked cars and to trees
+_KERB_M = (4.6, 7.0)  # from the route to parked cars and to trees
 _WALLS = ("facade0", "facade1", "facade0", "brick")
 
 
@@ -56,7 +56,7 @@ def _beside(route: Float, along_m: float, aside_m: float) -> tuple[Float, float]
 
 
 def _clear_m(route: Float, place: Float, length: float, depth: float, yaw: float) -> float:
-    """Return the distance from a rectangle on the ground, by its centre, to the route."""
+    """Return the distance from a rectangle on the ground, given by its centre (2,), size and yaw, to the route."""
     c, s = np.cos(yaw), np.sin(yaw)
     local = (route - place) @ np.array([[c, -s], [s, c]])
     outside = np.maximum(np.abs(local) - 0.5 * np.array([length, depth]), 0.0)
@@ -64,7 +64,7 @@ def _clear_m(route: Float, place: Float, length: float, depth: float, yaw: float
 
 
 def _houses(world: World, route: Float, side: int, rng: np.random.Generator) -> None:
-    """Add a row of houses, which is open where the street turns towards it."""
+    """Add a row of houses, with gaps where the street turns towards it."""
     along, number = 0.0, 0
     while along < _STEP_M * len(route):
         length, depth, height = rng.uniform((9.0, 10.0, 6.0), (22.0, 14.0, 16.0)).tolist()
