@@ -35,7 +35,7 @@ from graphvio.frontend.motion.cost import camera_motions
 from graphvio.frontend.motion.depth_errors import by_depth_errors
 from graphvio.frontend.motion.depth_scale import with_unknown_scales
 from graphvio.frontend.motion.observations import Observations, RigArrays, correspond
-from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
+from graphvio.frontend.motion.readout_errors import derivatives_by_readout
 from graphvio.frontend.motion.selection import best_pair_motion, searched_and_refined
 from graphvio.frontend.pairs.extrinsic_monitor import warm_up_extrinsic_monitor
 from graphvio.frontend.singles import SinglesFrontend
@@ -214,7 +214,7 @@ def _warm_up_motion(rig: Rig, config: Config) -> None:
     warm_up_extrinsic_monitor(motion)
     by_depth_errors(arrays, observations, motion.inlier, np.eye(4))
     if any(camera.line_time_us for camera in rig.cameras):
-        derivatives_by_velocities(
+        derivatives_by_readout(
             arrays, observations, motion.inlier, np.eye(4), config.motion.pixel_sigma_px, np.zeros((2, _POINTS))
         )
     if rig.pairs and rig.singles:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
-from graphvio.arrays import AnyArray, Float
+from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.depth.tracks import TrackedFrame
@@ -159,6 +159,24 @@ def test_an_error_of_p12_that_is_known_to_be_possible_is_no_contradiction() -> N
     seen = mixed((TRUTH, 80), (se3_exp(-off) @ TRUTH @ se3_exp(off), 80))
     assert agreement_of(seen).contradicts
     assert not agreement_of(seen, uncertain={1: PLACE}).contradicts
+
+
+def test_errors_that_the_pairs_have_in_common_are_no_contradiction() -> None:
+    """An error that turns the motion of one pair and not that of the other, such as of a gyro within the readout."""
+    turned = transform([0.0, 0.003, 0.0], [0.0, 0.0, 0.0]) @ TRUTH
+    seen = mixed((TRUTH, 80), (turned, 80))
+    by_error = {0: np.zeros((6, 1)), 1: np.eye(6)[:, 1:2] * 0.003}
+    rng = np.random.default_rng(0)
+    joint = searched_and_refined(ARRAYS, seen, STILL, CONFIG, rng)
+    assert agreement_of(seen).contradicts
+    for shared, contradicts in ((by_error, False), (dict.fromkeys((0, 1), by_error[1]), True)):
+
+        def of_pair(pair: int, inlier: Bool, cur_T_ref: Float, shared: Mapping[int, Float] = shared) -> Float:
+            return shared[pair]
+
+        agreement = agree(ARRAYS, seen, joint, CONFIG, rng, shared_errors=of_pair)
+        assert agreement.contradicts == contradicts
+    assert agreement.own[0].covariance[1, 1] > 0.003**2  # the motions are as uncertain as the error
 
 
 def test_a_second_motion_of_all_pairs_is_not_mixed_with_what_the_pairs_say_alone() -> None:

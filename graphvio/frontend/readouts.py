@@ -13,13 +13,15 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.frontend.depth.tracks import TrackedFrame, common_rows
 from graphvio.frontend.motion.observations import RigArrays, correspond
-from graphvio.frontend.motion.readout_errors import derivatives_by_velocities
+from graphvio.frontend.motion.readout_errors import derivatives_by_readout
+from graphvio.frontend.pairs.agreement import SharedErrors
 from graphvio.frontend.references import References
 from graphvio.frontend.tracking.measured_readouts import MeasuredReadouts
 from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
 from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.geometry import se3_inverse
+from graphvio.linear_algebra import cholesky
 from graphvio.measurements.motion import ByVelocities
 from graphvio.rig import Rig
 
@@ -36,7 +38,9 @@ class Readouts:
 
     def __init__(self, rig: Rig) -> None:
         self._line_s = [1e-6 * group.left.line_time_us for group in rig.groups]
-        self._measured = MeasuredReadouts(max(camera.readout_ns for camera in rig.cameras))
+        readout_ns = max(camera.readout_ns for camera in rig.cameras)
+        self._rate_sigma = 0.0 if rig.imu is None else rig.imu.gyro_noise_density / float(np.sqrt(1e-9 * readout_ns))
+        self._measured = MeasuredReadouts(readout_ns)
         self._applied: dict[int, ReadoutMotion] = {}  # by stamp
 
     def keep(self, seen: TrackedFrameset, references: References) -> None:
@@ -108,8 +112,8 @@ class Readouts:
 
     def errors(
         self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
-    ) -> ByVelocities:
-        """Return the derivatives of a motion with respect to the velocities, and the velocities with covariances.
+    ) -> tuple[ByVelocities, Float]:
+        """Return how a motion depends on the velocities of the readouts, and its covariance by angular velocities.
 
         Args:
             seen: the tracks of the frameset.
@@ -117,17 +121,68 @@ class Readouts:
             inlier: (N,) the points that the motion explains.
             cur_T_ref: (4, 4) the motion of body.
             noise_px: standard deviation of the pixel noise.
+
+        Returns:
+            The derivatives with respect to the velocities, which have covariances; and the covariance (6, 6) by the
+            noise of the gyro within the readouts.
         """
         seconds, observations = self._line_seconds(seen), seen.correspondences.observations
-        derivatives = derivatives_by_velocities(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
+        derivatives = derivatives_by_readout(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
+        used, covariances, rate_sigmas = self._velocities(seen)
+        by_rates = np.hstack(list(rate_sigmas[:, None, None] * derivatives[:, :, :3]))
+        return ByVelocities(used, derivatives[:, :, 3:], covariances), by_rates @ by_rates.T
+
+    def shared_errors(self, seen: TrackedFrameset, arrays: RigArrays, noise_px: float) -> SharedErrors:
+        """Return the function that computes by what the readouts' errors, common to all pairs, change a pair's motion.
+
+        Args:
+            seen: the tracks of the frameset.
+            arrays: the calibration of the rig.
+            noise_px: standard deviation of the pixel noise.
+        """
+        seconds, observations = self._line_seconds(seen), seen.correspondences.observations
+        roots = self._roots(seen)
+
+        def of_pair(pair: int, inlier: Bool, cur_T_ref: Float) -> Float:
+            own, rows = observations.of_pair(pair), observations.pair == pair
+            of_rows = np.ascontiguousarray(seconds[:, rows])
+            return np.hstack(list(derivatives_by_readout(arrays, own, inlier, cur_T_ref, noise_px, of_rows) @ roots))
+
+        return of_pair
+
+    def covariance(
+        self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
+    ) -> Float:
+        """Return the covariance (6, 6) of a motion by all errors of the readouts; for arguments see `errors`."""
+        seconds, observations = self._line_seconds(seen), seen.correspondences.observations
+        derivatives = derivatives_by_readout(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
+        by_errors = np.hstack(list(derivatives @ self._roots(seen)))
+        return np.asarray(by_errors @ by_errors.T)
+
+    def _roots(self, seen: TrackedFrameset) -> Float:
+        """Return Cholesky factors (2, 6, 6) of the covariances of ``[angular velocity, velocity]``."""
+        _, covariances, rate_sigmas = self._velocities(seen)
+        roots = np.zeros((2, 6, 6))
+        for k in range(2):
+            roots[k, :3, :3], roots[k, 3:, 3:] = rate_sigmas[k] * np.eye(3), cholesky(covariances[k])
+        return roots
+
+    def _velocities(self, seen: TrackedFrameset) -> tuple[Float, Float, Float]:
+        """Return the velocities (2, 3) of the readouts now and at the reference, and how uncertain they are.
+
+        Returns:
+            The velocities, their covariances (2, 3, 3), and the standard deviations (2,) of the mean angular velocities
+            by the noise of the gyro; zero where no gyro has measured them.
+        """
         readouts = seen.readout, self._applied.get(seen.reference_stamp_ns)
         used, covariances = np.zeros((2, 3)), np.tile(_UNKNOWN_SIGMA_M_S**2 * np.eye(3), (2, 1, 1))
+        rate_sigmas = np.zeros(2)
         for k, readout in enumerate(readouts):
             if readout is not None:
-                used[k] = readout.velocity
+                used[k], rate_sigmas[k] = readout.velocity, self._rate_sigma if readout.is_by_imu else 0.0
                 if readout.velocity_covariance is not None:
                     covariances[k] = readout.velocity_covariance
-        return ByVelocities(used, derivatives, covariances)
+        return used, covariances, rate_sigmas
 
     def _line_seconds(self, seen: TrackedFrameset) -> Float:
         """Return the seconds (2, N) from the stamp until each point's line was exposed, now and at the reference."""

@@ -158,7 +158,8 @@ class VisualFrontend(TrackingFrontend):
         if config.selection == "joint":
             refined, observations = joint_motion(arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
-            agreement = agree(arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt)
+            shared = None if self._readouts is None else self._readouts.shared_errors(seen, arrays, self._noise_px)
+            agreement = agree(arrays, observations, refined, config, rng, self._extrinsics.uncertain, in_doubt, shared)
             if agreement.contradicts:
                 self._contradicted_ns = seen.stamp_ns
             if len(agreement.hypotheses) > 1:
@@ -323,8 +324,14 @@ class VisualFrontend(TrackingFrontend):
         are_singles = is_of_singles(self._extrinsics.arrays, seen.correspondences.observations, refined)
         predicted = motion_since(seen.reference_stamp_ns) if are_singles else None
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
+        covariance = refined.covariance
+        if self._readouts is not None and self._rig.singles:
+            arrays = self._extrinsics.arrays
+            covariance = covariance + self._readouts.covariance(
+                seen, arrays, refined.inlier, refined.cur_T_ref, self._noise_px
+            )
         for j in seen.frames:
-            self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, refined.covariance)
+            self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, covariance)
 
     def _is_in_doubt(self, now_ns: int) -> bool:
         """Return whether the pairs contradicted each other a moment ago."""
@@ -359,14 +366,16 @@ class VisualFrontend(TrackingFrontend):
     def _with_readout_errors(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
     ) -> RelativeMotion:
-        """Add the derivatives of a motion with respect to the velocities by which rolling shutters are compensated.
+        """Add the effect of the velocities by which rolling shutters are compensated: derivatives, and gyro noise.
 
         Without an IMU no state has these velocities: their uncertainty is then added to the covariance instead.
         """
         if self._readouts is None:
             return motion
-        errors = self._readouts.errors(seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px)
-        motion = replace(motion, by_velocities=errors)
+        errors, by_rates = self._readouts.errors(
+            seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px
+        )
+        motion = replace(motion, by_velocities=errors, covariance=motion.covariance + by_rates)
         return motion if seen.readout is not None and seen.readout.is_by_imu else motion.with_any_velocity()
 
     def _scale_covariance(self, ref_T_cur: Float) -> Float:

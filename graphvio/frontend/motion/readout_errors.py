@@ -15,13 +15,14 @@ _SCALE = 10.0  # of the cost, in standard deviations: inliers get nearly equal w
 _PRIOR = 1e-2  # information of a motion's rotation and translation, so that some directions may be unknown
 
 
-def derivatives_by_velocities(
+def derivatives_by_readout(
     rig: RigArrays, observations: Observations, inlier: Bool, cur_T_ref: Float, sigma_px: float, seconds: Float
 ) -> Float:
-    """Return the derivatives of a motion with respect to the velocities now and at the reference.
+    """Return the derivatives of a motion with respect to the velocities of the readouts now and at the reference.
 
     A line that is exposed some time after the stamp sees points from the camera's position at that time. An error of
-    the velocity, multiplied by that time, shifts the line's points as a translation would. In a narrow view, different
+    the velocity, multiplied by that time, shifts the line's points as a translation would, and an error of the angular
+    velocity turns them. In a narrow view, different
     shifts at the top and at the bottom look like a rotation of the camera, and the error of the motion is larger than
     that of the displacement within the readout.
 
@@ -34,11 +35,12 @@ def derivatives_by_velocities(
         seconds: (2, N) from the stamp until a point's line was exposed, now and at the reference.
 
     Returns:
-        (2, 6, 3) derivatives, see `graphvio.measurements.motion.ByVelocities`.
+        (2, 6, 6) derivatives with respect to ``[angular velocity, velocity]`` of body, see
+        `graphvio.measurements.motion.ByVelocities`.
     """
     motion = np.ascontiguousarray(cur_T_ref)
     information, now, then = _moments(rig, observations, inlier.astype(np.float64), motion, sigma_px, seconds)
-    shifts = np.array([now[:, 3:], -then @ se3_adjoint(motion)[:, 3:]])
+    shifts = np.array([now, -then @ se3_adjoint(motion)])
     return np.array([solve_rows(information + _PRIOR * np.eye(6), np.ascontiguousarray(each.T)).T for each in shifts])
 
 

@@ -6,7 +6,7 @@ all points would then be right for no pair. Instead, the motion of each consensu
 better-supported one comes first, as in eq. (4).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -25,6 +25,11 @@ from graphvio.linear_algebra import squared_length
 
 _T = THRESHOLDS.agreement
 _NONE: Mapping[int, Float] = {}
+_NOT_SHARED: Float = np.zeros((6, 1))
+
+SharedErrors = Callable[[int, Bool, Float], Float]
+"""Function of a pair's index, and inliers (M,) and ``cur_T_ref`` (4, 4) of its own motion: returns by what errors of
+unit variance that all pairs have in common change that motion, (6, K), tangent ``[rotation, translation]``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +59,8 @@ class Agreement:
         hypotheses: One if all pairs with enough inliers agree; else one for each consensus set, the best supported
             first. Among sets of comparable support, the one with the lowest pair index comes first, since extrinsics
             are relative to pair 0. If many points fit none of them, a second rigid motion is one more hypothesis.
-        own: Pair index -> its own motion, for pairs with enough inliers, as if the extrinsics were exact.
+        own: Pair index -> its own motion, for pairs with enough inliers, as if the extrinsics were exact. Its
+            covariance includes that of errors that the pairs have in common.
         max_distance: Largest squared Mahalanobis distance between two pairs of a consensus set, 0 for a single pair.
         contradicts: Whether the motions of two pairs differ by more than 5 sigma.
     """
@@ -73,6 +79,7 @@ def agree(
     rng: np.random.Generator,
     uncertain: Mapping[int, Float] = _NONE,
     in_doubt: bool = False,
+    shared_errors: SharedErrors | None = None,
 ) -> Agreement:
     """Compare the pairs' own motions, and return the motion of each consensus set.
 
@@ -86,6 +93,7 @@ def agree(
             for pairs whose extrinsics have been corrected or are not known exactly.
         in_doubt: Whether the pairs contradicted each other a moment ago; the largest distance of motions that agree is
             then smaller.
+        shared_errors: Errors that all pairs have in common, or None if there are none.
     """
     everyone = observations.pairs
     own: dict[int, Refined] = {}
@@ -95,8 +103,13 @@ def agree(
     elif everyone:
         joint = placed(joint, uncertain.get(everyone[0]))
     placed_motions = {j: placed(motion, uncertain.get(j)) for j, motion in own.items()}
+    shared = {
+        j: _NOT_SHARED if shared_errors is None else shared_errors(j, motion.inlier, motion.cur_T_ref)
+        for j, motion in own.items()
+    }
     apart = {
-        (i, j): disagreement(placed_motions[i], placed_motions[j]) for i, j in combinations(sorted(placed_motions), 2)
+        (i, j): disagreement(placed_motions[i], placed_motions[j], shared[i] - shared[j])
+        for i, j in combinations(sorted(placed_motions), 2)
     }
     sets = _consensus_sets(sorted(own, key=lambda j: -int(own[j].inlier.sum())), apart, in_doubt)
     max_distance = max((apart[pair] for pairs in sets for pair in combinations(sorted(pairs), 2)), default=0.0)
@@ -113,6 +126,7 @@ def agree(
     if second is not None:
         best = max(hypothesis.support for hypothesis in hypotheses)
         hypotheses = [second, *hypotheses] if second.support > best else [*hypotheses, second]
+    own = {j: replace(each, covariance=each.covariance + shared[j] @ shared[j].T) for j, each in own.items()}
     return Agreement(tuple(hypotheses), own, max_distance, max(apart.values(), default=0.0) >= _T.max_distance)
 
 
@@ -145,10 +159,16 @@ def _in_order(hypotheses: list[MotionHypothesis], unknown: frozenset[int] = froz
     return ordered if hypotheses is last else ordered + last
 
 
-def disagreement(one: Refined, other: Refined) -> float:
-    """Return the squared Mahalanobis distance between two independent measurements of one motion of body."""
+def disagreement(one: Refined, other: Refined, by_shared: Float = _NOT_SHARED) -> float:
+    """Return the squared Mahalanobis distance between two measurements of one motion of body.
+
+    Args:
+        one: a measurement.
+        other: an independent one.
+        by_shared: (6, K) by what K errors that both have in common, of unit variance, change their difference.
+    """
     apart = se3_log(se3_compose(one.cur_T_ref, se3_inverse(other.cur_T_ref)))
-    return squared_length(apart, one.covariance + other.covariance)
+    return squared_length(apart, one.covariance + other.covariance + by_shared @ by_shared.T)
 
 
 def is_supported(inlier: Bool, config: MotionConfig) -> bool:
