@@ -627,6 +627,24 @@ def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_le
     assert np.abs(other.left.body_T_cam - in_file.left.body_T_cam).max() < 1e-5
 
 
+@pytest.mark.parametrize("has_agreed", [False, True])
+def test_self_calibration_with_whose_first_window_pairs_never_agreed_takes_another_window(
+    has_agreed: bool,
+) -> None:
+    true, written, _ = sampled(2, 1)
+    walk, calibration = Walk(true), SelfCalibration(written)
+    agreeing = 0
+    for stamp_ns, pose, views in walk.framesets(10.0):
+        calibration.update()
+        may_agree = not calibration.has_full_window or (has_agreed and agreeing < 12)
+        agreeing += calibration.has_full_window and may_agree
+        calibration.add_frameset(stamp_ns, pose, views, are_contradicting=not may_agree)
+    calibration.close()
+    assert calibration.has_full_window
+    assert not calibration.estimate.is_file_exact
+    assert calibration.is_confirmed == (not has_agreed)
+
+
 def known_cameras(rig: Rig) -> Float:
     """Return the covariance of cameras that are known ten times better than by a file."""
     n = n_camera_parameters(rig)

@@ -210,9 +210,9 @@ class SelfCalibration:
     @property
     def is_trusted(self) -> bool:
         """Whether contradictions of pairs are attributed to the scene, and no longer to the calibration."""
-        if self.has_full_window:
+        if self.is_confirmed:
             return True
-        return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
+        return (self.has_full_window or self.estimate.is_file_exact) and self._agreeing >= _MIN_AGREEING
 
     @property
     def _n_camera_parameters(self) -> int:
@@ -284,6 +284,8 @@ class SelfCalibration:
         if adjusted.is_full:
             self._evidence, self._refused, self._implausible = adjusted.evidence, 0, []
             self._used_windows += 1
+            if not adjusted.estimate.is_file_exact:
+                self._agreeing = 0  # with the calibration before
         solution, n = adjusted.solution, self._n_camera_parameters
         if (
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
