@@ -23,7 +23,7 @@ from graphvio import Odometry, RigError, load_rig, open_source, save_rig
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
-from graphvio.geometry import se3_adjoint, se3_inverse, so3_exp, so3_log
+from graphvio.geometry import se3, se3_adjoint, se3_inverse, so3_exp, so3_log
 from graphvio.live.running import LiveOdometry
 from graphvio.live.source import SelectedCameras
 from graphvio.live.sources import open_live_source
@@ -755,6 +755,20 @@ def test_the_equations_of_a_prior_are_the_derivatives_of_its_cost(seed: int) -> 
     np.testing.assert_allclose(hessian, by_step.T @ prior.information @ by_step, atol=1e-6 * np.abs(hessian).max())
 
 
+def test_a_prior_in_another_frame_has_the_same_cost() -> None:
+    states, prior, _ = prior_between_poses(np.random.default_rng(0))
+    m = len(prior.gradient)
+    root = np.random.default_rng(1).normal(size=(m, m))
+    prior = Prior(prior.at, root @ root.T, np.random.default_rng(2).normal(size=m))
+    moved = states.moved(0.01 * np.random.default_rng(3).normal(size=m))
+    new_T_odom = se3(so3_exp(np.array([0.3, -0.8, 0.5])), np.zeros(3))
+    costs = [
+        add_prior(each, at, 0, np.zeros((m, m)), np.zeros(m))
+        for each, at in ((prior, moved), (prior.turned(new_T_odom), moved.turned(new_T_odom)))
+    ]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_prior_that_knows_no_scale_does_not_pull_at_it_when_the_poses_move(seed: int) -> None:
     states, prior, step = prior_between_poses(np.random.default_rng(seed))
@@ -1053,6 +1067,22 @@ def test_first_window_by_a_wrong_file_finds_a_time_offset_of_either_sign(
     estimate = flown.estimator.calibration
     assert estimate is not None
     assert abs(estimate.time_offset_s - 1e-3 * offset_ms) < 3.0 * estimate.sigmas[-1]
+
+
+def test_trajectory_has_no_step_where_the_rig_file_proves_wrong() -> None:
+    rig, factors = single_rig(), list[tuple[float, bool]]()
+    _, written = wrong_by(rig, 1)
+    flown = fly(
+        moving(), 6.0, fewer, rig=rig, believed=written, seed=6,
+        on_keyframe=lambda t, estimator, _: factors.append((t, estimator._calibration.is_file_exact)),
+    )  # fmt: skip
+    proven_s = next(t for t, is_exact in factors if not is_exact)
+    assert proven_s > flown.stamps_s[0] + 1.0
+    k = int(np.searchsorted(flown.stamps_s, proven_s - 1e-6))
+    truth = [moving().pose(t) for t in flown.stamps_s[k - 1 : k + 1]]
+    step = se3_inverse(se3_inverse(truth[0]) @ truth[1]) @ se3_inverse(flown.poses[k - 1]) @ flown.poses[k]
+    assert np.linalg.norm(step[:3, 3]) < 0.01
+    assert aligned(flown)[0] < 0.01
 
 
 def test_an_epoch_after_the_dark_begins_with_the_calibration_that_was_learnt() -> None:

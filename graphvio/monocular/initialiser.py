@@ -249,15 +249,9 @@ class Initialiser:
         states = window.states
         body_T_odom = se3_inverse(states.poses[0])
         nav_T_odom = se3(level(-body_T_odom[:3, :3] @ states.gravity), np.zeros(3)) @ body_T_odom
-        turn = nav_T_odom[:3, :3]
         window.landmarks.turn(nav_T_odom)
         assert window.prior is not None
-        turned = replace(
-            states,
-            poses=nav_T_odom @ states.poses,
-            velocities=states.velocities @ turn.T,
-            gravity=turn @ states.gravity,
-        )
+        turned = states.turned(nav_T_odom)
         known = window.prior.at
         at = replace(turned.of(np.arange(1)), biases=known.biases)
         return replace(window, states=turned, prior=window.prior._replace(at=at))

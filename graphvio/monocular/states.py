@@ -67,6 +67,13 @@ class States:
         """Return some of the states, by their indices."""
         return replace(self, stamps_ns=self.stamps_ns[kept], poses=self.poses[kept], velocities=self.velocities[kept])
 
+    def turned(self, new_T_odom: Float) -> States:
+        """Return the states in another frame, given by ``new_T_odom`` (4, 4)."""
+        turn = new_T_odom[:3, :3]
+        return replace(
+            self, poses=new_T_odom @ self.poses, velocities=self.velocities @ turn.T, gravity=turn @ self.gravity
+        )
+
     def moved(self, step: Float) -> States:
         """Return the states after a step of all unknowns, or of all but the calibration."""
         n = len(self.poses)

@@ -64,6 +64,12 @@ class KeyframeWindow:
         self.views.append(self.landmark_ids.join(camera_tracks))
         self.stationary.append(is_stationary)
 
+    def turn(self, new_T_odom: Float) -> None:
+        """Express the window in another frame, given by ``new_T_odom`` (4, 4)."""
+        self.states = self.states.turned(new_T_odom)
+        self.prior = None if self.prior is None else self.prior.turned(new_T_odom)
+        self.landmarks.turn(new_T_odom)
+
     def without_newest(self) -> KeyframeWindow:
         """Return the window as it was before the newest state, with the same landmarks."""
         kept = self.states.of(np.arange(len(self.states.poses) - 1))

@@ -19,7 +19,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import so3_log, so3_right_jacobian_inverse
 from graphvio.kernels import kernel
 from graphvio.linear_algebra import times, turn_rows
-from graphvio.monocular.states import States, add_block, columns_of
+from graphvio.monocular.states import GRAVITY, States, add_block, columns_of
 
 _STANDSTILL_M = 0.05  # rms size of a window that practically stands at a point, and has no scale
 
@@ -52,6 +52,17 @@ class Prior(NamedTuple):
     at: States
     information: Float
     gradient: Float
+
+    def turned(self, new_T_odom: Float) -> Prior:
+        """Return the prior in another frame, given by ``new_T_odom`` (4, 4).
+
+        Perturbations of poses are in the axes of body; only velocities and gravity have those of the frame.
+        """
+        m = len(self.at.poses)
+        turn = np.eye(len(self.gradient))
+        for at in range(6 * m, 9 * m + GRAVITY, 3):
+            turn[at : at + 3, at : at + 3] = new_T_odom[:3, :3]
+        return Prior(self.at.turned(new_T_odom), turn @ self.information @ turn.T, turn @ self.gradient)
 
     def difference(self, states: States) -> Difference:
         """Return the difference of the current values of the same states from those at the linearisation."""

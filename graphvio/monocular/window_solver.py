@@ -14,6 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
+from graphvio.geometry import se3_inverse
 from graphvio.measurements.motion import LocatedPoints
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, covariance_of, views_only
@@ -130,11 +131,7 @@ class WindowSolver:
             window.landmarks.put(held.ids, *held.moved_along(adjusted.states))
             adjusted, ids = self._adjusted(window, None, _KEYFRAME_STEPS)
         if is_keyframe and calibration.update_factors(adjusted, window.prior):
-            adjusted = adjust(
-                adjusted.measured, adjusted.states, adjusted.landmarks, window.prior, _RECALIBRATION_STEPS,
-                calibration.file(), _CONVERGED,
-            )  # fmt: skip
-            _put(adjusted, window, ids)
+            adjusted = self._recalibrated(window, adjusted, ids)
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
         is_tracking, dropped = self._leave_out_moving(window, adjusted, ids)
         self._solved = Solved(adjusted, ids, window.views[-1])
@@ -187,6 +184,25 @@ class WindowSolver:
                     adjusted = forwards
         _put(adjusted, window, ids)
         return adjusted, ids
+
+    def _recalibrated(self, window: KeyframeWindow, before: Adjusted, ids: Int) -> Adjusted:
+        """Adjust a window with other factors of the rig file, and let the path of the cameras continue.
+
+        With another calibration the window's past is another one, too. The window is expressed in the frame in which
+        the first camera is at the newest state where it was, so that the trajectory has no step. Body turns there by as
+        much as its attitude relative to the camera is corrected.
+        """
+        file = self.calibration.file()
+        after = adjust(
+            before.measured, before.states, before.landmarks, window.prior, _RECALIBRATION_STEPS, file, _CONVERGED
+        )
+        _put(after, window, ids)
+        then, now = (
+            each.states.poses[-1] @ each.states.cameras(self._cameras).body_T_cam[0] for each in (before, after)
+        )
+        window.turn(then @ se3_inverse(now))
+        structure, places, _ = self._structure(window)
+        return adjust(after.measured._replace(structure=structure), window.states, places, window.prior, 0, file)
 
     def _structure(self, window: KeyframeWindow) -> tuple[Structure, Float, Int]:
         """Return the window's landmarks, where they are (L, 3), and their identities (L,)."""
