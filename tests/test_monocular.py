@@ -1083,6 +1083,9 @@ def test_trajectory_has_no_step_where_the_rig_file_proves_wrong() -> None:
     step = se3_inverse(se3_inverse(truth[0]) @ truth[1]) @ se3_inverse(flown.poses[k - 1]) @ flown.poses[k]
     assert np.linalg.norm(step[:3, 3]) < 0.01
     assert aligned(flown)[0] < 0.01
+    covariance = flown.estimator.covariance_of_turns(flown.poses[k])  # of the step that would have been
+    assert np.sqrt(np.trace(covariance[3:, 3:])) > 0.02
+    assert not fly(moving(), 2.0).estimator.covariance_of_turns(flown.poses[k]).any()
 
 
 def test_an_epoch_after_the_dark_begins_with_the_calibration_that_was_learnt() -> None:

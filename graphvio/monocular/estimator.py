@@ -139,6 +139,10 @@ class MonocularEstimator:
         """Return the covariance (6, 6) of the motion since a keyframe of the window, in the newest body frame."""
         return self._solver.covariance_since(then_ns)
 
+    def covariance_of_turns(self, odom_T_body: Float) -> Float:
+        """Return the covariance (6, 6) of a pose by changes of the frame, see `WindowSolver.covariance_of_turns`."""
+        return self._solver.covariance_of_turns(odom_T_body)
+
     def located_points(self) -> dict[int, LocatedPoints]:
         """Return the points that the newest state sees, by camera."""
         return self._solver.located_points()

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
-from graphvio.geometry import se3_inverse
+from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.measurements.motion import LocatedPoints
 from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, covariance_of, views_only
@@ -84,6 +84,7 @@ class WindowSolver:
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
         self._held: HeldLandmarks | None = None
+        self._turns: list[Float] = []  # (6,) tangents of the epoch's changes of the frame, see `_recalibrated`
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
 
@@ -105,6 +106,16 @@ class WindowSolver:
     def on_views(self, on_views: Callable[[WindowViews | FirstWindow], None]) -> None:
         """Register a function that gets the views of each landmark once, as it leaves the window or the window ends."""
         self._on_views = on_views
+
+    def covariance_of_turns(self, odom_T_body: Float) -> Float:
+        """Return the covariance (6, 6) of a pose (4, 4) by the steps that were taken out of the trajectory.
+
+        Relative to the first pose, the trajectory is off by as much as its frame was turned where the rig file had
+        proved wrong; the covariance of the state does not include this. The tangent is in body.
+        """
+        body_by_odom = se3_adjoint(se3_inverse(odom_T_body))
+        turns = body_by_odom @ np.array(self._turns).reshape(-1, 6).T
+        return np.asarray(turns @ turns.T)
 
     # ------------------------------------------------------------------ one window
 
@@ -162,7 +173,7 @@ class WindowSolver:
 
     def forget(self) -> None:
         """Forget the last solution, with the covariance of its newest state."""
-        self._solved, self._held, self.covariance = None, None, NO_COVARIANCE
+        self._solved, self._held, self.covariance, self._turns = None, None, NO_COVARIANCE, []
 
     # ------------------------------------------------------------------ parts of these steps
 
@@ -200,7 +211,9 @@ class WindowSolver:
         then, now = (
             each.states.poses[-1] @ each.states.cameras(self._cameras).body_T_cam[0] for each in (before, after)
         )
-        window.turn(then @ se3_inverse(now))
+        new_T_odom = then @ se3_inverse(now)
+        self._turns.append(se3_log(new_T_odom))
+        window.turn(new_T_odom)
         structure, places, _ = self._structure(window)
         return adjust(after.measured._replace(structure=structure), window.states, places, window.prior, 0, file)
 

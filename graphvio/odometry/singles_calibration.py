@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from graphvio.arrays import Float
 from graphvio.frontend.singles import SinglesFrontend
 from graphvio.measurements.estimate import Status
@@ -133,8 +131,8 @@ class SinglesCalibration:
         """Do nothing: `update` never changes the pose."""
 
     def pose_covariance(self, odom_T_body: Float) -> Float:
-        """Return zero: the state's covariance already includes errors of the calibration."""
-        return np.zeros((6, 6))
+        """Return the covariance by changes of the frame; the state's includes the errors of the calibration."""
+        return self._estimator.covariance_of_turns(odom_T_body)
 
     def close(self) -> None:
         """Do nothing: nothing runs beside the odometry."""
