@@ -177,7 +177,7 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     if any(camera.line_time_us for camera in rig.cameras):
         readout = ReadoutMotion.steady(np.eye(4), 1.0)
         pixels_at_lines(group.left, frame.pixels, np.zeros(len(frame.ids)), readout)
-        if not rig.pairs:
+        if rig.singles:
             turned_rays(group.left, frame.pixels, readout)
     undo_filters(np.frombuffer(bytes(2), dtype=np.uint8).reshape(1, 2), 1, np.zeros((2, 1), dtype=np.uint8))
     common_rows(frame.ids, frame.ids)

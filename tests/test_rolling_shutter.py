@@ -355,6 +355,45 @@ def test_line_times_are_of_the_points_rows_now_and_at_the_reference() -> None:
     np.testing.assert_allclose(seconds, expected)
 
 
+def test_errors_of_readouts_are_those_of_both_velocities_and_of_the_gyro() -> None:
+    pairs = small_rig(2)
+    rig = pairs.with_cameras(rolling)
+    assert rig.imu is not None
+    random = np.random.default_rng(6)
+    points = np.column_stack([random.uniform(-0.3, 0.3, (20, 2)), np.full(20, 0.3)])
+    reference, frames = (
+        {j: tracked(points, 100.0 * points[:, :2], random.uniform(0.0, 200.0, 20)) for j in range(2)} for _ in range(2)
+    )
+    covariances = np.array([np.diag([1e-4, 4e-4, 9e-4]), np.diag([1e-6, 0.0, 1e-2])])
+    readouts, motions = Readouts(rig), [replace(MOTION, velocity_covariance=c, is_by_imu=True) for c in covariances]
+    seen = TrackedFrameset(
+        50_000_000, Frozen(frozenset(), None, ""), frames, reference, correspond(reference, frames), motions[0]
+    )
+    readouts._applied[seen.reference_stamp_ns] = motions[1]
+    arrays, inlier, observations = RigArrays.of(rig), np.ones(20, dtype=bool), seen.correspondences.observations
+    rates = rig.imu.gyro_noise_density**2 / (1e-9 * rig.cameras[0].readout_ns) * np.eye(3)
+    every = np.ones(40, dtype=bool)
+    for j, rows in ((0, slice(0, 20)), (1, slice(20, 40))):
+        derivatives = derivatives_by_readout(
+            arrays, observations.of_pair(j), inlier, np.eye(4), 0.3,
+            np.ascontiguousarray(readouts._line_seconds(seen)[:, rows]),
+        )  # fmt: skip
+        by_errors = readouts.shared_errors(seen, arrays, 0.3)(j, inlier, np.eye(4))
+        expected = sum(
+            d[:, :3] @ rates @ d[:, :3].T + d[:, 3:] @ c @ d[:, 3:].T
+            for d, c in zip(derivatives, covariances, strict=True)
+        )
+        np.testing.assert_allclose(by_errors @ by_errors.T, expected, rtol=1e-6, atol=1e-15)
+    by_velocities, (now, then) = readouts.errors(seen, arrays, every, np.eye(4), 0.3)
+    derivatives = derivatives_by_readout(arrays, observations, every, np.eye(4), 0.3, readouts._line_seconds(seen))
+    np.testing.assert_array_equal(by_velocities.derivatives, derivatives[:, :, 3:])
+    for found, each in ((now, derivatives[0]), (then, derivatives[1])):
+        np.testing.assert_allclose(found, each[:, :3] @ rates @ each[:, :3].T, rtol=1e-6, atol=1e-15)
+    whole = readouts.covariance(seen, arrays, every, np.eye(4), 0.3)
+    by_both = sum(d[:, 3:] @ c @ d[:, 3:].T for d, c in zip(derivatives, covariances, strict=True))
+    np.testing.assert_allclose(whole, now + then + by_both, rtol=1e-6, atol=1e-15)
+
+
 @pytest.mark.parametrize("is_single", [False, True])
 def test_compensating_again_is_compensating_once(is_single: bool) -> None:
     rig = half_size_rig().with_cameras(rolling)
@@ -471,6 +510,23 @@ def fast_walk() -> Path:
 @pytest.fixture(scope="module")
 def two_pairs() -> Path:
     return rendered_room("rolling-two-pairs", default_rig().with_cameras(half_size).with_cameras(rolling), 3.5, 10.0)
+
+
+@pytest.fixture(scope="module")
+def noisy_pairs() -> Path:
+    """Two pairs that are read out in 29 ms, beside a gyro with eight times the usual noise."""
+    rig = default_rig().with_cameras(half_size).with_cameras(lambda camera: replace(camera, line_time_us=29e3 / 240))
+    assert rig.imu is not None
+    imu = replace(rig.imu, gyro_noise_density=8.0 * rig.imu.gyro_noise_density)
+    return rendered_room("rolling-noisy-pairs", replace(rig, imu=imu), 3.0, 15.0)
+
+
+def test_pairs_beside_a_noisy_gyro_do_not_contradict_each_other(noisy_pairs: Path) -> None:
+    source = open_source(noisy_pairs)
+    odometry = Odometry(source.rig)
+    for measurement in source:
+        odometry.process(measurement)
+    assert odometry.take_events() == []
 
 
 @pytest.fixture(scope="module")

@@ -230,6 +230,10 @@ def test_run_with_a_rolling_single_camera_doubts_no_exact_calibration(walk: Path
     posed = [estimate for estimate in estimates if estimate.nav_T_body is not None]
     assert len(posed) == len(estimates)
     assert source.truth is not None
+    reference = odometry._frontend._references.of(SINGLE)
+    assert reference is not None
+    sigmas = SIGMA_PX * np.sqrt(reference.covariances[:, 2, 2])
+    assert np.mean(sigmas < 0.1 * reference.points[:, 2]) > 0.4  # by the points' motion through several keyframes
     poses = np.array([estimate.nav_T_body for estimate in posed])
     found = evaluate(Trajectory(np.array([e.stamp_ns for e in posed]), poses), load_trajectory(source.truth))
     assert found.ate_position_m.rmse < 1e-3

@@ -628,10 +628,10 @@ def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_le
 
 
 @pytest.mark.parametrize("has_agreed", [False, True])
-def test_self_calibration_with_whose_first_window_pairs_never_agreed_takes_another_window(
+def test_self_calibration_takes_another_window_if_pairs_never_agreed_under_the_first_one(
     has_agreed: bool,
 ) -> None:
-    true, written, _ = sampled(2, 1)
+    written, true, _ = sampled(2, 1)
     walk, calibration = Walk(true), SelfCalibration(written)
     agreeing = 0
     for stamp_ns, pose, views in walk.framesets(10.0):

@@ -21,7 +21,6 @@ from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
 from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.geometry import se3_inverse
-from graphvio.linear_algebra import cholesky
 from graphvio.measurements.motion import ByVelocities
 from graphvio.rig import Rig
 
@@ -113,7 +112,7 @@ class Readouts:
     def errors(
         self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
     ) -> tuple[ByVelocities, Float]:
-        """Return how a motion depends on the velocities of the readouts, and its covariance by angular velocities.
+        """Return how a motion depends on the velocities of the readouts, and its covariances by the gyro's noise.
 
         Args:
             seen: the tracks of the frameset.
@@ -123,17 +122,19 @@ class Readouts:
             noise_px: standard deviation of the pixel noise.
 
         Returns:
-            The derivatives with respect to the velocities, which have covariances; and the covariance (6, 6) by the
-            noise of the gyro within the readouts.
+            The derivatives with respect to the velocities, and the velocities with their covariances; and the
+            covariances (2, 6, 6) of the motion by the noise of the gyro within the readouts now and at the reference.
         """
         seconds, observations = self._line_seconds(seen), seen.correspondences.observations
         derivatives = derivatives_by_readout(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
         used, covariances, rate_sigmas = self._velocities(seen)
-        by_rates = np.hstack(list(rate_sigmas[:, None, None] * derivatives[:, :, :3]))
-        return ByVelocities(used, derivatives[:, :, 3:], covariances), by_rates @ by_rates.T
+        by_rates = rate_sigmas[:, None, None] * derivatives[:, :, :3]
+        return ByVelocities(used, derivatives[:, :, 3:], covariances), by_rates @ by_rates.transpose(0, 2, 1)
 
     def shared_errors(self, seen: TrackedFrameset, arrays: RigArrays, noise_px: float) -> SharedErrors:
-        """Return the function that computes by what the readouts' errors, common to all pairs, change a pair's motion.
+        """Return the function that computes a pair's derivatives with respect to the errors of the readouts.
+
+        These errors are common to all pairs.
 
         Args:
             seen: the tracks of the frameset.
@@ -160,11 +161,12 @@ class Readouts:
         return np.asarray(by_errors @ by_errors.T)
 
     def _roots(self, seen: TrackedFrameset) -> Float:
-        """Return Cholesky factors (2, 6, 6) of the covariances of ``[angular velocity, velocity]``."""
+        """Return square roots (2, 6, 6) of the covariances of ``[angular velocity, velocity]``, now and then."""
         _, covariances, rate_sigmas = self._velocities(seen)
+        variances, axes = np.linalg.eigh(covariances)
         roots = np.zeros((2, 6, 6))
-        for k in range(2):
-            roots[k, :3, :3], roots[k, 3:, 3:] = rate_sigmas[k] * np.eye(3), cholesky(covariances[k])
+        roots[:, :3, :3] = rate_sigmas[:, None, None] * np.eye(3)
+        roots[:, 3:, 3:] = axes * np.sqrt(np.maximum(variances, 0.0))[:, None]
         return roots
 
     def _velocities(self, seen: TrackedFrameset) -> tuple[Float, Float, Float]:
@@ -172,7 +174,7 @@ class Readouts:
 
         Returns:
             The velocities, their covariances (2, 3, 3), and the standard deviations (2,) of the mean angular velocities
-            by the noise of the gyro; zero where no gyro has measured them.
+            by the noise of the gyro; zero without a gyro, where errors of angular velocities are not accounted for.
         """
         readouts = seen.readout, self._applied.get(seen.reference_stamp_ns)
         used, covariances = np.zeros((2, 3)), np.tile(_UNKNOWN_SIGMA_M_S**2 * np.eye(3), (2, 1, 1))
@@ -215,7 +217,7 @@ def readout_sigma_px(frame: TrackedFrame, reference: TrackedFrame | None, focal_
 
     Args:
         frame: the tracks of a single camera with a rolling shutter.
-        reference: its reference frame, where the depths of the tracks are known, or None.
+        reference: its reference frame, which has the covariances of the depths, or None.
         focal_px: focal length, pixels per normalised image unit.
 
     Returns:

@@ -108,7 +108,7 @@ class VisualFrontend(TrackingFrontend):
                 if frame.is_single and self._rig.groups[j].left.line_time_us:
                     sigma_px = readout_sigma_px(frame, self._references.of(j), self._rig.groups[j].left.focal_px)
                     frames[j] = frame.keep(sigma_px * self._config.motion.pixel_sigma_px < _MAX_READOUT_SIGMA_PX)
-        return frames
+        return {j: frame for j, frame in frames.items() if len(frame.ids) or not frame.is_single}
 
     # ------------------------------------------------------------------ one frameset
 
@@ -372,10 +372,13 @@ class VisualFrontend(TrackingFrontend):
         """
         if self._readouts is None:
             return motion
-        errors, by_rates = self._readouts.errors(
+        errors, (now, then) = self._readouts.errors(
             seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px
         )
-        motion = replace(motion, by_velocities=errors, covariance=motion.covariance + by_rates)
+        shared = motion.shared_covariance + then if motion.shared_covariance.any() else motion.shared_covariance
+        motion = replace(
+            motion, by_velocities=errors, covariance=motion.covariance + now + then, shared_covariance=shared
+        )
         return motion if seen.readout is not None and seen.readout.is_by_imu else motion.with_any_velocity()
 
     def _scale_covariance(self, ref_T_cur: Float) -> Float:

@@ -69,6 +69,7 @@ class PairsCalibration:
         self._reported: set[str] = set()  # names of pairs
         self._calibration = SelfCalibration(rig)
         self._motion: RelativeMotion | None = None  # motion by vision at the newest frameset
+        self._are_contradicting = False  # whether several motions are seen there
         self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
         self._in_force = np.zeros_like(self.estimate.difference)  # difference of the calibration from the rig file
@@ -114,7 +115,7 @@ class PairsCalibration:
 
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
         """Attach to each motion the innovation covariance that errors of the calibration add."""
-        self._motion = visual.motion
+        self._motion, self._are_contradicting = visual.motion, bool(visual.alternatives)
         if self._innovation_covariance is None:
             return visual
         return self._innovation_covariance.with_calibration_covariance(visual, self._estimator)
@@ -136,6 +137,9 @@ class PairsCalibration:
         is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
         if not (is_usable or is_urgent) or not self._frontend.are_velocities_known:
             return
+        is_first_window_doubted = calibration.has_full_window and not calibration.is_trusted
+        if is_first_window_doubted and quality is Quality.WEAK and not self._are_contradicting:
+            return  # the images are at fault, and not the calibration
         views = views_of(self._frontend.compensated_frames_at(stamp_ns))
         tolerant = self._imu_fault_tolerant
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()

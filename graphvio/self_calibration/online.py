@@ -99,7 +99,7 @@ class SelfCalibration:
         self._in_force = self._nominal
         self._in_force_covariance = self._prior.covariance[: self._n_camera_parameters, : self._n_camera_parameters]
         self._knocks = KnockDetector()
-        self._agreeing = 0  # keyframes whose pairs agreed
+        self._agreeing = 0  # keyframes whose pairs agreed, before the first window or since
         self._refused = 0  # full windows, one after the other
         self._implausible: list[Gaussian] = []  # calibrations of full windows by which the file is implausibly wrong
         self._are_cameras_beyond_any = False  # whether two full windows agree that the file's cameras are so wrong
@@ -150,8 +150,8 @@ class SelfCalibration:
             stamp_ns: stamp of the frameset.
             odom_T_body: (4, 4) its estimated pose.
             views: index of the pair or single camera -> tracks.
-            are_contradicting: whether the pairs' motions contradict each other. If they always did, this is attributed
-                to the calibration; if they once agreed, to the scene.
+            are_contradicting: whether the pairs' motions contradict each other. If they always did under this
+                calibration, this is attributed to the calibration; if they agreed for some keyframes, to the scene.
             is_urgent: whether motions cannot be measured with the calibration in force: an adjustment that is due comes
                 into force with this frameset then. Its left and right images alone show how far epipolar lines are off.
         """
@@ -284,8 +284,8 @@ class SelfCalibration:
         if adjusted.is_full:
             self._evidence, self._refused, self._implausible = adjusted.evidence, 0, []
             self._used_windows += 1
-            if not adjusted.estimate.is_file_exact:
-                self._agreeing = 0  # with the calibration before
+            if not adjusted.estimate.is_file_exact and len(self._rig.groups) > 1:
+                self._agreeing = 0  # those agreed under the calibration before this one
         solution, n = adjusted.solution, self._n_camera_parameters
         if (
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE

@@ -1,4 +1,4 @@
-"""Derivatives of a motion with respect to the velocities by which rolling shutters are compensated."""
+"""Derivatives of a motion with respect to the angular and linear velocities that compensate rolling shutters."""
 
 import numpy as np
 
@@ -22,9 +22,8 @@ def derivatives_by_readout(
 
     A line that is exposed some time after the stamp sees points from the camera's position at that time. An error of
     the velocity, multiplied by that time, shifts the line's points as a translation would, and an error of the angular
-    velocity turns them. In a narrow view, different
-    shifts at the top and at the bottom look like a rotation of the camera, and the error of the motion is larger than
-    that of the displacement within the readout.
+    velocity turns them. In a narrow view, different shifts at the top and at the bottom look like a rotation of the
+    camera, and the error of the motion is larger than that of the displacement within the readout.
 
     Args:
         rig: calibration of P pairs.
@@ -35,8 +34,8 @@ def derivatives_by_readout(
         seconds: (2, N) from the stamp until a point's line was exposed, now and at the reference.
 
     Returns:
-        (2, 6, 6) derivatives with respect to ``[angular velocity, velocity]`` of body, see
-        `graphvio.measurements.motion.ByVelocities`.
+        (2, 6, 6) derivatives with respect to ``[angular velocity, velocity]`` of body; those with respect to the
+        velocity are the derivatives of `graphvio.measurements.motion.ByVelocities`.
     """
     motion = np.ascontiguousarray(cur_T_ref)
     information, now, then = _moments(rig, observations, inlier.astype(np.float64), motion, sigma_px, seconds)

@@ -28,8 +28,11 @@ _NONE: Mapping[int, Float] = {}
 _NOT_SHARED: Float = np.zeros((6, 1))
 
 SharedErrors = Callable[[int, Bool, Float], Float]
-"""Function of a pair's index, and inliers (M,) and ``cur_T_ref`` (4, 4) of its own motion: returns by what errors of
-unit variance that all pairs have in common change that motion, (6, K), tangent ``[rotation, translation]``."""
+"""Function of a pair's index, and of inliers (M,) and ``cur_T_ref`` (4, 4) of its own motion.
+
+It returns the derivatives (6, K) of that motion, tangent ``[rotation, translation]``, with respect to K errors of unit
+variance that all pairs have in common.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +167,9 @@ def disagreement(one: Refined, other: Refined, by_shared: Float = _NOT_SHARED) -
 
     Args:
         one: a measurement.
-        other: an independent one.
-        by_shared: (6, K) by what K errors that both have in common, of unit variance, change their difference.
+        other: another one, independent of it but for ``by_shared``.
+        by_shared: (6, K) derivatives of their difference with respect to K errors of unit variance that both have in
+            common.
     """
     apart = se3_log(se3_compose(one.cur_T_ref, se3_inverse(other.cur_T_ref)))
     return squared_length(apart, one.covariance + other.covariance + by_shared @ by_shared.T)
