@@ -137,8 +137,7 @@ class PairsCalibration:
         is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
         if not (is_usable or is_urgent) or not self._frontend.are_velocities_known:
             return
-        is_first_window_doubted = calibration.has_full_window and not calibration.is_trusted
-        if is_first_window_doubted and quality is Quality.WEAK and not self._are_contradicting:
+        if calibration.is_first_window_doubted and quality is Quality.WEAK and not self._are_contradicting:
             return  # the images are at fault, and not the calibration
         views = views_of(self._frontend.compensated_frames_at(stamp_ns))
         tolerant = self._imu_fault_tolerant

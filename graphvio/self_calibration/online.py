@@ -161,7 +161,7 @@ class SelfCalibration:
         if self.is_trusted:
             if knocked := self._knocked(views):
                 self._forget_extrinsics(knocked)
-            elif are_contradicting:
+            elif are_contradicting and not self.is_first_window_doubted:
                 return
         self._agreeing += not are_contradicting
         self._collector.add(stamp_ns, odom_T_body, views)
@@ -210,9 +210,14 @@ class SelfCalibration:
     @property
     def is_trusted(self) -> bool:
         """Whether contradictions of pairs are attributed to the scene, and no longer to the calibration."""
-        if self.is_confirmed:
+        if self.has_full_window:
             return True
-        return (self.has_full_window or self.estimate.is_file_exact) and self._agreeing >= _MIN_AGREEING
+        return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
+
+    @property
+    def is_first_window_doubted(self) -> bool:
+        """Whether the pairs have hardly agreed under the calibration of the first window, which may then be wrong."""
+        return self._used_windows == 1 and self._agreeing < _MIN_AGREEING
 
     @property
     def _n_camera_parameters(self) -> int:
