@@ -26,16 +26,19 @@ def benchmark(
             autocompletion=completion.dataset,
         ),
     ],
-    folder: Annotated[Path, typer.Argument(help="Folder that holds its sequences, at any place.")],
+    folder: Annotated[Path, typer.Argument(help="Folder that contains the sequences, in any subfolder.")],
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Folder for the results, new or empty.  [default: results/benchmark-DATASET-N]"),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", help="Sequences at once.  [default: half of the cores]", min=1)
+        int | None,
+        typer.Option(
+            "--jobs", help="Number of sequences that run at the same time.  [default: half of the cores]", min=1
+        ),
     ] = None,
     sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Only these, such as MH_01,V1_01.  [default: all that are there]")
+        str | None, typer.Option("--sequences", help="Run only these sequences, such as MH_01,V1_01.  [default: all]")
     ] = None,
     rig: options.RigFile = None,
     config: options.ConfigName = "default",

@@ -48,7 +48,7 @@ def calibrate(
     ] = False,
     guide: Annotated[
         bool,
-        typer.Option("--guide", help="Say while reading which motions are still needed."),
+        typer.Option("--guide", help="Print while reading which motions are still needed."),
     ] = False,
     scale: options.Scale = "auto",
     config: options.ConfigName = "default",
@@ -126,7 +126,7 @@ def calibrate(
 def calibrate_trajectories(
     trajectories: Annotated[list[Path], typer.Argument(help="Two or more: TUM, EuRoC, or csv with TUM's columns.")],
     same_clock: Annotated[
-        bool, typer.Option("--same-clock", help="All stamps are of one clock: no offset is estimated.")
+        bool, typer.Option("--same-clock", help="All stamps are from one clock; no offset is estimated.")
     ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="Write all numbers to this new file (.yaml).", metavar="FILE")

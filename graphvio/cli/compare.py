@@ -33,7 +33,7 @@ def compare(
         Path | None, typer.Option("--plot", help="Plot all errors over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
     smoothed: Annotated[
-        bool, typer.Option("--smoothed", help="In result folders, use the poses as they left the window.")
+        bool, typer.Option("--smoothed", help="For result folders, use the smoothed poses instead of the causal ones.")
     ] = False,
     max_ate: Annotated[
         float | None,

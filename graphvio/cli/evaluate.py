@@ -21,7 +21,9 @@ def evaluate(
     trajectory: Annotated[
         Path, typer.Argument(help="Estimated trajectory: result folder, TUM, EuRoC, KITTI, or BAG:TOPIC.")
     ],
-    truth: Annotated[Path, typer.Argument(help="True trajectory: such a file, or a recording that has one.")],
+    truth: Annotated[
+        Path, typer.Argument(help="True trajectory: a file in one of these formats, or a recording that has one.")
+    ],
     plot: Annotated[
         Path | None, typer.Option(help="Plot both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,

@@ -20,13 +20,15 @@ _Scheduler = Annotated[
     str | None,
     typer.Option(
         "--scheduler",
-        help="A Dask scheduler that runs, such as tcp://host:8786.  [default: workers on this machine]",
+        help="Address of a running Dask scheduler, such as tcp://host:8786.  [default: workers on this machine]",
         metavar="ADDRESS",
     ),
 ]
 _Workers = Annotated[
     int | None,
-    typer.Option("--workers", help="Processes on this machine.  [default: half its cores, and two at least]", min=1),
+    typer.Option(
+        "--workers", help="Number of processes on this machine.  [default: half its cores, and two at least]", min=1
+    ),
 ]
 
 fleet = typer.Typer(help="Many sessions side by side, on this machine or on a Dask cluster.", no_args_is_help=True)

@@ -39,7 +39,7 @@ Source = Annotated[
     ),
 ]
 RigFile = Annotated[
-    Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
+    Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: that of the recording]")
 ]
 ConfigName = Annotated[
     str,
@@ -51,7 +51,7 @@ Topics = Annotated[
     str | None,
     typer.Option(
         "--topics",
-        help="For sessions and bags: which topic is of which camera of the rig, or of the IMU, such as "
+        help="For sessions and bags: topics of the rig's cameras and of the IMU, such as "
         "cam0=/left/image,imu=/imu/data.  [default: by their names]",
     ),
 ]
@@ -66,18 +66,18 @@ Cameras = Annotated[
     ),
 ]
 NoPairs = Annotated[
-    bool, typer.Option("--no-pairs", help="Take each camera for a single one; the IMU shows the scale.")
+    bool, typer.Option("--no-pairs", help="Use each camera as a single camera; the scale is estimated with the IMU.")
 ]
-NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]
+NoImu = Annotated[bool, typer.Option("--no-imu", help="Do not use the IMU.")]
 FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.", callback=seconds)]
 ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.", callback=seconds)]
-View = Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")]
+View = Annotated[bool, typer.Option("--view", help="Show the run in the rerun viewer.")]
 SaveRrd = Annotated[Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")]
-NoLoops = Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")]
+NoLoops = Annotated[bool, typer.Option("--no-loops", help="Do not search for loop closures.")]
 RefineCalibration = Annotated[
     bool,
     typer.Option(
-        "--refine-calibration", help="Also estimate where the pairs are, and the IMU's time offset, in the graph."
+        "--refine-calibration", help="Also estimate the pairs' extrinsics and the IMU's time offset in the graph."
     ),
 ]
 Png = Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")]
@@ -98,14 +98,18 @@ Ros2Domain = Annotated[
 ]
 ForgetCalibration = Annotated[
     bool,
-    typer.Option("--forget-calibration", help="Use the rig file, and not what earlier runs learnt."),
+    typer.Option(
+        "--forget-calibration", help="Use the rig file, not the calibration that earlier runs have estimated."
+    ),
 ]
 Duration = Annotated[
-    float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS", callback=duration)
+    float | None, typer.Option("--for", help="Stop after this many seconds.", metavar="SECONDS", callback=duration)
 ]
 WebPort = Annotated[
     int | None,
-    typer.Option("--web", help="Show it in a browser of this machine, on this port and the next.", min=1, max=65534),
+    typer.Option(
+        "--web", help="Show the run in a browser on this machine; this port and the next are used.", min=1, max=65534
+    ),
 ]
 ReportFolder = Annotated[
     Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
@@ -114,14 +118,19 @@ Scale = Annotated[
     str,
     typer.Option(
         "--scale",
-        help="Lengths that a camera measures may be wrong by a factor: auto, estimate or fixed.",
+        help="Scale factor of the lengths that a camera measures: auto, estimate or fixed.",
         autocompletion=completion.scale_mode,
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)]
+Seed = Annotated[
+    int, typer.Option("--seed", help="Seed of all random choices; the same seed gives the same result.", min=0)
+]
 Times = Annotated[
     Path | None,
-    typer.Option("--times", help="Stamps of KITTI poses, seconds, one a line.  [default: times.txt next to them]"),
+    typer.Option(
+        "--times",
+        help="File with the stamps of KITTI poses, seconds, one in each line.  [default: times.txt next to them]",
+    ),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")]
 

@@ -27,19 +27,21 @@ def simulate(
     duration: Annotated[
         float | None, typer.Option("--duration", help="Seconds of the walk.  [default: all of it]")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of all noise: same seed, same bytes.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Seed of all noise; the same seed gives the same recording, to the byte.")
+    ] = 0,
     rate: Annotated[
         float | None,
         typer.Option("--rate", help="Framesets per second.  [default: 20, and 10 in the street]"),
     ] = None,
     trigger_offset_ms: Annotated[
-        float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the previous one.")
+        float, typer.Option("--trigger-offset-ms", help="Delay of each pair's trigger after that of the previous pair.")
     ] = 0.0,
     calibration_error: Annotated[
         str | None,
         typer.Option(
             "--calibration-error",
-            help="Files are as wrong as by a calibration that is careful (1), usual (2) or of long ago (3).  "
+            help="Errors of the files: of a careful calibration (1), a usual one (2) or an outdated one (3).  "
             "[default: exact]",
             metavar="LEVEL",
         ),
@@ -48,7 +50,7 @@ def simulate(
         list[str] | None,
         typer.Option(
             "--calibration-component",
-            help="Only this error, and others that are named so: focal, principal-point, distortion, "
+            help="Apply only this component of the error; may be repeated: focal, principal-point, distortion, "
             "left-right-rotation, baseline, cameras-in-body, pair-transform, time-offset, imu-scale, imu-misalignment "
             "or imu-noise.  [default: all]",
             metavar="NAME",
@@ -56,13 +58,13 @@ def simulate(
         ),
     ] = None,
     calibration_seed: Annotated[
-        int | None, typer.Option("--calibration-seed", help="Of the calibration error.  [default: that of --seed]")
+        int | None, typer.Option("--calibration-seed", help="Seed of the calibration error.  [default: that of --seed]")
     ] = None,
     rig_change: Annotated[
         str | None,
         typer.Option(
             "--rig-change",
-            help="What happens to the true cameras on the way: thermal, a slow drift, or knock, in the middle.  "
+            help="Change of the true cameras during the walk: thermal (slow drift) or knock (sudden, in the middle).  "
             "[default: nothing]",
             metavar="NAME",
             autocompletion=completion.rig_change,
