@@ -217,7 +217,7 @@ class SelfCalibration:
     @property
     def is_first_window_doubted(self) -> bool:
         """Whether the pairs have hardly agreed under the calibration of the first window, which may then be wrong."""
-        return self._used_windows == 1 and self._agreeing < _MIN_AGREEING
+        return len(self._rig.groups) > 1 and self._used_windows == 1 and self._agreeing < _MIN_AGREEING
 
     @property
     def _n_camera_parameters(self) -> int:
@@ -289,7 +289,7 @@ class SelfCalibration:
         if adjusted.is_full:
             self._evidence, self._refused, self._implausible = adjusted.evidence, 0, []
             self._used_windows += 1
-            if not adjusted.estimate.is_file_exact and len(self._rig.groups) > 1:
+            if not adjusted.estimate.is_file_exact:
                 self._agreeing = 0  # those agreed under the calibration before this one
         solution, n = adjusted.solution, self._n_camera_parameters
         if (
