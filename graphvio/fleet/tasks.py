@@ -78,6 +78,7 @@ def odometry(job: Job) -> Marker:
     """Run the odometry; the marker's figures are from the summary, and ``parts``, the number of feature tasks."""
 
     def work(task: _Task) -> dict[str, Any]:
+        """Calibrate if it is wanted, record the odometry, and return the figures of its summary."""
         if task.stages.calibrates_first:
             task.stages.calibrate(0)
         record = task.stages.record(0)
@@ -102,6 +103,7 @@ def features(job: Job, part: int, parts: int) -> Marker:
     """Extract the features of one part of the places into a separate database."""
 
     def work(task: _Task) -> dict[str, Any]:
+        """Write the features of this part's places; there are no figures."""
         task.fetch(ODOMETRY)
         session = task.stages.places(0, task.record())
         stamps = [place.stamp_ns for place in session.places]
@@ -119,6 +121,7 @@ def loops(job: Job, parts: int) -> Marker:
     """Join the databases of all parts, and find loop closures."""
 
     def work(task: _Task) -> dict[str, Any]:
+        """Merge the parts' features, and return the number of loop closures found."""
         task.fetch(ODOMETRY, *(features_stage(part, parts) for part in range(parts)))
         record = task.record()
         session = task.stages.places(0, record)
@@ -140,6 +143,7 @@ def graph(job: Job) -> Marker:
     """Optimise the session as one graph, and write the results."""
 
     def work(task: _Task) -> dict[str, Any]:
+        """Solve the graph, and return the figures of its result."""
         task.fetch(ODOMETRY, *([LOOPS] if job.with_loops else []))
         closures = load_closures(task.folder / "loops.npz") if job.with_loops else None
         found = task.stages.result([task.record()], closures)

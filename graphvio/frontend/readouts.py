@@ -141,8 +141,7 @@ class Readouts:
             arrays: the calibration of the rig.
             noise_px: standard deviation of the pixel noise.
         """
-        seconds, observations = self._line_seconds(seen), seen.correspondences.observations
-        roots = self._roots(seen)
+        seconds, observations, roots = self._line_seconds(seen), seen.correspondences.observations, self._roots(seen)
 
         def of_pair(pair: int, inlier: Bool, cur_T_ref: Float) -> Float:
             own, rows = observations.of_pair(pair), observations.pair == pair
@@ -150,15 +149,6 @@ class Readouts:
             return np.hstack(list(derivatives_by_readout(arrays, own, inlier, cur_T_ref, noise_px, of_rows) @ roots))
 
         return of_pair
-
-    def covariance(
-        self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
-    ) -> Float:
-        """Return the covariance (6, 6) of a motion by all errors of the readouts; for arguments see `errors`."""
-        seconds, observations = self._line_seconds(seen), seen.correspondences.observations
-        derivatives = derivatives_by_readout(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
-        by_errors = np.hstack(list(derivatives @ self._roots(seen)))
-        return np.asarray(by_errors @ by_errors.T)
 
     def _roots(self, seen: TrackedFrameset) -> Float:
         """Return square roots (2, 6, 6) of the covariances of ``[angular velocity, velocity]``, now and then."""

@@ -326,10 +326,10 @@ class VisualFrontend(TrackingFrontend):
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
         covariance = refined.covariance
         if self._readouts is not None and self._rig.singles:
-            arrays = self._extrinsics.arrays
-            covariance = covariance + self._readouts.covariance(
-                seen, arrays, refined.inlier, refined.cur_T_ref, self._noise_px
+            errors, by_gyro_noise = self._readouts.errors(
+                seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px
             )
+            covariance = covariance + (errors.covariances_of_motion + by_gyro_noise).sum(axis=0)
         for j in seen.frames:
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, covariance)
 
@@ -372,13 +372,10 @@ class VisualFrontend(TrackingFrontend):
         """
         if self._readouts is None:
             return motion
-        errors, (now, then) = self._readouts.errors(
+        errors, by_gyro_noise = self._readouts.errors(
             seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px
         )
-        shared = motion.shared_covariance + then if motion.shared_covariance.any() else motion.shared_covariance
-        motion = replace(
-            motion, by_velocities=errors, covariance=motion.covariance + now + then, shared_covariance=shared
-        )
+        motion = replace(motion.with_errors(*by_gyro_noise), by_velocities=errors)
         return motion if seen.readout is not None and seen.readout.is_by_imu else motion.with_any_velocity()
 
     def _scale_covariance(self, ref_T_cur: Float) -> Float:

@@ -67,6 +67,11 @@ class ByVelocities(NamedTuple):
     derivatives: Float
     covariances: Float
 
+    @property
+    def covariances_of_motion(self) -> Float:
+        """Covariances (2, 6, 6) of the motion by errors of the velocities, now and at the reference."""
+        return np.array([by @ each @ by.T for by, each in zip(self.derivatives, self.covariances, strict=True)])
+
 
 @dataclass(frozen=True, eq=False)
 class RelativeMotion:
@@ -106,10 +111,15 @@ class RelativeMotion:
         """Return the motion with a covariance that includes errors of the velocities in ``by_velocities``."""
         if self.by_velocities is None:
             return self
-        _, derivatives, covariances = self.by_velocities
-        now, then = (each @ covariance @ each.T for each, covariance in zip(derivatives, covariances, strict=True))
+        return replace(self.with_errors(*self.by_velocities.covariances_of_motion), by_velocities=None)
+
+    def with_errors(self, now: Float, then: Float) -> RelativeMotion:
+        """Return the motion with the covariances (6, 6) of more errors, now and at the reference.
+
+        All motions from the reference share the latter, if they share anything.
+        """
         shared = self.shared_covariance + then if self.shared_covariance.any() else self.shared_covariance
-        return replace(self, covariance=self.covariance + now + then, shared_covariance=shared, by_velocities=None)
+        return replace(self, covariance=self.covariance + now + then, shared_covariance=shared)
 
     @property
     def duration_s(self) -> float:
