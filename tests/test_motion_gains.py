@@ -27,7 +27,7 @@ def test_gain_of_wrong_extrinsics_is_that_of_the_motion_in_another_body() -> Non
     for k, pose in enumerate(poses):
         gains.add(k, k, pose, None, NONE)
         if k == 1:
-            gains.note_keyframe()
+            gains.note_keyframe(k)
     found = gains.since(1)
     assert found is not None
     d = 1e-4 * np.array([1.0, -2.0, 0.5, 1.0, 3.0, -1.0])
@@ -45,7 +45,7 @@ def test_gain_of_wrong_depths_adds_up_over_references() -> None:
     of_first, of_second = rng.standard_normal((2, 2, 2, 6))
     gains, poses = MotionGains(RIG), [np.linalg.matrix_power(STEP, k) for k in range(3)]
     gains.add(0, 0, poses[0], None, NONE)
-    gains.note_keyframe()
+    gains.note_keyframe(0)
     gains.add(1, 1, poses[1], motion(0, 1, of_first), frozenset({0}))
     gains.add(2, 2, poses[2], motion(1, 2, of_second), frozenset({1}))
     found = gains.since(0)
@@ -63,7 +63,7 @@ def test_framesets_that_nothing_needs_are_forgotten() -> None:
     for k in range(500):
         gains.add(k, k, np.eye(4), None, frozenset({3}))
         if k % 2:
-            gains.note_keyframe()
+            gains.note_keyframe(k)
     assert len(gains._framesets) < 70
     assert gains.since(499) is not None
     assert gains.since(1) is None
@@ -75,7 +75,7 @@ def test_gain_since_the_keyframe_that_was_adjusted_last_is_known_however_long_ag
     gains = MotionGains(RIG)
     for k in range(500):
         gains.add(k, 1000 + k, np.linalg.matrix_power(STEP, k % 7), None, NONE, None if k < 2 else 1001)
-        gains.note_keyframe()
+        gains.note_keyframe(1000 + k)
     found = gains.since(1001)
     assert found is not None
     assert found.by_cameras[:, extrinsics_of(RIG, 0)].any()

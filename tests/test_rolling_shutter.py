@@ -34,9 +34,10 @@ from graphvio.frontend.tracking.rolling_shutter import (
 from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.inertial_state import InertialState
-from graphvio.measurements.motion import ByVelocities, RelativeMotion
+from graphvio.measurements.motion import ByVelocities, Quality, RelativeMotion
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.monocular.equations import visual_equations
 from graphvio.monocular.reprojection import Cameras
@@ -262,6 +263,59 @@ def test_velocities_are_not_those_of_framesets_within_two_readouts() -> None:
     assert readouts.at(33_000_000) is None
     readouts.note(0, 66_000_000, body_at(0.066), (None, None))
     assert readouts.at(66_000_000) is not None
+
+
+@pytest.mark.parametrize("peak", [0.1, 4.0], ids=["walk", "shaken"])
+def test_errors_of_velocities_by_vision_are_within_their_covariances(peak: float) -> None:
+    """Sinusoids of 1.5 Hz, of a walk and of a shaken head, whose phases are random."""
+    random, step_ns, wave = np.random.default_rng(8), 50_000_000, 2.0 * np.pi * 1.5
+    squares: dict[bool, list[Float]] = {False: [], True: []}
+    for phase in random.uniform(0.0, 2.0 * np.pi, 60):
+        axes = np.linalg.qr(random.normal(size=(3, 3)))[0][:2]
+
+        def pose(k: int, phase: float = phase, axes: Float = axes) -> Float:
+            swing = peak / wave * np.sin(wave * 1e-9 * step_ns * k + phase)
+            return se3(so3_exp(swing * axes[0]), swing * axes[1])
+
+        readouts = MeasuredReadouts(20_000_000)
+        for k in range(1, 12):
+            readouts.note(step_ns * (k - 1), step_ns * k, se3_inverse(pose(k - 1)) @ pose(k), (None, None))
+        for k in 10, 11:
+            assert readouts.knows_both_sides_of(step_ns * k) == (k == 10)
+            found, rate = readouts.at(step_ns * k), peak * np.cos(wave * 1e-9 * step_ns * k + phase)
+            assert found is not None
+            assert found.velocity_covariance is not None
+            turn = pose(k)[:3, :3]
+            true = np.concatenate([rate * axes[0], rate * turn.T @ axes[1]])
+            sigmas = np.repeat([found.angular_velocity_sigma, np.sqrt(found.velocity_covariance[0, 0])], 3)
+            squares[k == 10].append(((np.concatenate([found.angular_velocity, found.velocity]) - true) / sigmas) ** 2)
+    for each in squares.values():
+        angular, linear = np.mean(each, axis=0).reshape(2, 3).mean(axis=1)
+        assert angular < 1.5
+        assert linear < 1.5
+        assert peak < 1.0 or min(angular, linear) > 0.05
+
+
+def test_frameset_is_compensated_by_both_sides_only_after_a_later_one() -> None:
+    rig = half_size_rig().with_cameras(rolling).without_imu()
+    points, pair, readouts, step_ns = scene(rig), rig.pairs[0], Readouts(rig), 50_000_000
+    (left_px, _), (right_px, _) = seen(pair.left, points), seen(pair.right, points)
+    left, right = pair.left.unproject(left_px)[0], pair.right.unproject(right_px)[0]
+    found, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
+    frame = replace(
+        tracked(found, left_px, left_px[:, 1]), left_rays=left, right_rays=right, right_pixels=right_px,
+        covariances=covariances,
+    )  # fmt: skip
+    poses = [body_at(1e-9 * step_ns * k) for k in (-1, 0, 1)]
+    readouts._measured.note(-step_ns, 0, se3_inverse(poses[0]) @ poses[1], (None, None))
+    assert readouts.compensated_by_both_sides(0, {0: frame}, rig) is None
+    readouts._measured.note(0, step_ns, se3_inverse(poses[1]) @ poses[2], (None, None))
+    again = readouts.compensated_by_both_sides(0, {0: frame}, rig)
+    assert again is not None
+    by_truth = as_at_stamp(frame, pair, MOTION)
+    np.testing.assert_allclose(again[0].pixels_at_stamp, by_truth.pixels_at_stamp, atol=0.02)
+    assert np.abs(by_truth.pixels_at_stamp - left_px).max() > 1.0
+    assert readouts.compensated_by_both_sides(step_ns, {0: frame}, rig) is None
 
 
 def test_framesets_of_a_long_keyframe_are_forgotten() -> None:
@@ -614,6 +668,41 @@ def test_images_that_are_read_out_until_the_next_ones_are_as_accurate(fast_walk:
 def test_several_pairs_with_rolling_shutters_go_on_over_keyframes(has_imu: bool, two_pairs: Path) -> None:
     rig = open_source(two_pairs).rig
     assert ate_m(two_pairs, rig if has_imu else rig.without_imu(), 1.0) < (0.002 if has_imu else 0.01)
+
+
+def test_pairs_without_imu_do_not_contradict_each_other_and_doubt_no_exact_calibration(noisy_pairs: Path) -> None:
+    """The velocities that the images show lag behind the motion, by the same for both pairs."""
+    source = open_source(noisy_pairs, open_source(noisy_pairs).rig.without_imu())
+    odometry = Odometry(source.rig)
+    qualities = [each.vision for each in map(odometry.process, source) if each is not None]
+    qualities += [each.vision for each in odometry.finish()]
+    assert qualities.count(Quality.GOOD) >= 0.8 * len(qualities)
+    kinds = {event.kind for event in odometry.take_events()}
+    assert not kinds & {EventKind.EXTRINSICS_OFF, EventKind.CALIBRATION_CORRECTED}
+
+
+def test_framesets_without_imu_are_calibrated_by_after_the_next_one(
+    two_pairs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By points that are compensated with the velocities which the motion after them shows."""
+    calibrated: list[tuple[int, int]] = []
+    newest_ns = 0
+    add_frameset = SelfCalibration.add_frameset
+
+    def noting(self: SelfCalibration, stamp_ns: int, *others: Any) -> None:
+        calibrated.append((stamp_ns, newest_ns))
+        add_frameset(self, stamp_ns, *others)
+
+    monkeypatch.setattr(SelfCalibration, "add_frameset", noting)
+    source = open_source(two_pairs, open_source(two_pairs).rig.without_imu())
+    odometry = Odometry(source.rig)
+    for measurement in source:
+        newest_ns = measurement.stamp_ns
+        odometry.process(measurement)
+    stamps = [stamp_ns for stamp_ns, _ in calibrated]
+    assert len(stamps) > 20
+    assert stamps == sorted(set(stamps))
+    assert all(newest - stamp_ns == 100_000_000 for stamp_ns, newest in calibrated)
 
 
 @pytest.mark.parametrize("has_imu", [True, False])

@@ -6,6 +6,7 @@ the measured motions, and the frameset's motion is measured again.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from graphvio.frontend.motion.readout_errors import derivatives_by_readout
 from graphvio.frontend.pairs.agreement import SharedErrors
 from graphvio.frontend.references import References
 from graphvio.frontend.tracking.measured_readouts import MeasuredReadouts
-from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion
+from graphvio.frontend.tracking.rolling_shutter import ReadoutMotion, as_at_stamp
 from graphvio.frontend.tracking.tracker import GroupTracker
 from graphvio.frontend.tracking_frontend import TrackedFrameset
 from graphvio.geometry import se3_inverse
@@ -25,6 +26,7 @@ from graphvio.measurements.motion import ByVelocities
 from graphvio.rig import Rig
 
 _UNKNOWN_SIGMA_M_S = 0.5
+_UNKNOWN_SIGMA_RAD_S = 0.2
 _MIN_Z = 1e-3
 
 
@@ -38,7 +40,7 @@ class Readouts:
     def __init__(self, rig: Rig) -> None:
         self._line_s = [1e-6 * group.left.line_time_us for group in rig.groups]
         readout_ns = max(camera.readout_ns for camera in rig.cameras)
-        self._rate_sigma = 0.0 if rig.imu is None else rig.imu.gyro_noise_density / float(np.sqrt(1e-9 * readout_ns))
+        self._gyro_sigma = 0.0 if rig.imu is None else rig.imu.gyro_noise_density / float(np.sqrt(1e-9 * readout_ns))
         self._measured = MeasuredReadouts(readout_ns)
         self._applied: dict[int, ReadoutMotion] = {}  # by stamp
 
@@ -81,6 +83,26 @@ class Readouts:
             trackers[j].read_out_keyframe(keyframe, then)
         return TrackedFrameset(seen.stamp_ns, seen.frozen, frames, reference, correspond(reference, frames), now)
 
+    def compensated_by_both_sides(
+        self, stamp_ns: int, frames: Mapping[int, TrackedFrame], rig: Rig
+    ) -> dict[int, TrackedFrame] | None:
+        """Compensate an earlier frameset again, by velocities computed from framesets before and after it.
+
+        Args:
+            stamp_ns: stamp of the frameset.
+            frames: its tracks, by the index of the pair or single camera.
+            rig: the rig, with the calibration that is in force.
+
+        Returns:
+            The tracks, compensated again, or None while there is no later frameset.
+        """
+        readout = self._measured.at(stamp_ns) if self._measured.knows_both_sides_of(stamp_ns) else None
+        if readout is None:
+            return None
+        return {
+            j: as_at_stamp(frame, rig.groups[j], readout) if self._line_s[j] else frame for j, frame in frames.items()
+        }
+
     def with_unknown_depths(self, seen: TrackedFrameset, arrays: RigArrays, cur_T_ref: Float) -> TrackedFrameset:
         """Add the effect of unknown depths on the compensation to the covariances of single cameras' points.
 
@@ -112,7 +134,7 @@ class Readouts:
     def errors(
         self, seen: TrackedFrameset, arrays: RigArrays, inlier: Bool, cur_T_ref: Float, noise_px: float
     ) -> tuple[ByVelocities, Float]:
-        """Return how a motion depends on the velocities of the readouts, and its covariances by the gyro's noise.
+        """Return how a motion depends on the velocities of the readouts, and its covariances by angular velocities.
 
         Args:
             seen: the tracks of the frameset.
@@ -123,7 +145,7 @@ class Readouts:
 
         Returns:
             The derivatives with respect to the velocities, and the velocities with their covariances; and the
-            covariances (2, 6, 6) of the motion by the noise of the gyro within the readouts now and at the reference.
+            covariances (2, 6, 6) of the motion by errors of the angular velocities now and at the reference.
         """
         seconds, observations = self._line_seconds(seen), seen.correspondences.observations
         derivatives = derivatives_by_readout(arrays, observations, inlier, cur_T_ref, noise_px, seconds)
@@ -163,17 +185,20 @@ class Readouts:
         """Return the velocities (2, 3) of the readouts now and at the reference, and how uncertain they are.
 
         Returns:
-            The velocities, their covariances (2, 3, 3), and the standard deviations (2,) of the mean angular velocities
-            by the noise of the gyro; zero without a gyro, where errors of angular velocities are not accounted for.
+            The velocities, their covariances (2, 3, 3), and the standard deviations (2,) of the angular velocities: of
+            their means over the readout by the noise of the gyro, or those of vision.
         """
         readouts = seen.readout, self._applied.get(seen.reference_stamp_ns)
         used, covariances = np.zeros((2, 3)), np.tile(_UNKNOWN_SIGMA_M_S**2 * np.eye(3), (2, 1, 1))
-        rate_sigmas = np.zeros(2)
+        rate_sigmas = np.full(2, _UNKNOWN_SIGMA_RAD_S)
         for k, readout in enumerate(readouts):
-            if readout is not None:
-                used[k], rate_sigmas[k] = readout.velocity, self._rate_sigma if readout.is_by_imu else 0.0
-                if readout.velocity_covariance is not None:
-                    covariances[k] = readout.velocity_covariance
+            if readout is None:
+                continue
+            used[k] = readout.velocity
+            if readout.velocity_covariance is not None:
+                covariances[k], rate_sigmas[k] = readout.velocity_covariance, readout.angular_velocity_sigma
+            if readout.is_by_imu:
+                rate_sigmas[k] = self._gyro_sigma
         return used, covariances, rate_sigmas
 
     def _line_seconds(self, seen: TrackedFrameset) -> Float:

@@ -110,6 +110,20 @@ class VisualFrontend(TrackingFrontend):
                     frames[j] = frame.keep(sigma_px * self._config.motion.pixel_sigma_px < _MAX_READOUT_SIGMA_PX)
         return {j: frame for j, frame in frames.items() if len(frame.ids) or not frame.is_single}
 
+    def compensated_by_both_sides(
+        self, stamp_ns: int, frames: Mapping[int, TrackedFrame]
+    ) -> dict[int, TrackedFrame] | None:
+        """Compensate rolling shutters of an earlier frameset again, by motions before and after it.
+
+        Args:
+            stamp_ns: stamp of the frameset.
+            frames: its tracks, by the index of the pair or single camera.
+
+        Returns:
+            The tracks, compensated again, or None while there is no later frameset, or without rolling shutters.
+        """
+        return None if self._readouts is None else self._readouts.compensated_by_both_sides(stamp_ns, frames, self._rig)
+
     # ------------------------------------------------------------------ one frameset
 
     def _measure(self, seen: TrackedFrameset, motion_since: MotionPredictor) -> VisualResult:
@@ -326,10 +340,10 @@ class VisualFrontend(TrackingFrontend):
         cur_T_ref = refined.cur_T_ref if predicted is None else predicted
         covariance = refined.covariance
         if self._readouts is not None and self._rig.singles:
-            errors, by_gyro_noise = self._readouts.errors(
+            errors, by_rates = self._readouts.errors(
                 seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px
             )
-            covariance = covariance + (errors.covariances_of_motion + by_gyro_noise).sum(axis=0)
+            covariance = covariance + (errors.covariances_of_motion + by_rates).sum(axis=0)
         for j in seen.frames:
             self._histories[j].advance(seen.reference_stamp_ns, seen.stamp_ns, cur_T_ref, covariance)
 
@@ -366,16 +380,16 @@ class VisualFrontend(TrackingFrontend):
     def _with_readout_errors(
         self, motion: RelativeMotion, seen: TrackedFrameset, refined: Refined | FewPoints
     ) -> RelativeMotion:
-        """Add the effect of the velocities by which rolling shutters are compensated: derivatives, and gyro noise.
+        """Add the effect of the velocities by which rolling shutters are compensated to a motion.
 
-        Without an IMU no state has these velocities: their uncertainty is then added to the covariance instead.
+        Without an IMU no state has the linear velocities: their uncertainty is then added to the covariance instead.
         """
         if self._readouts is None:
             return motion
-        errors, by_gyro_noise = self._readouts.errors(
+        errors, by_rates = self._readouts.errors(
             seen, self._extrinsics.arrays, refined.inlier, refined.cur_T_ref, self._noise_px
         )
-        motion = replace(motion.with_errors(*by_gyro_noise), by_velocities=errors)
+        motion = replace(motion.with_errors(*by_rates), by_velocities=errors)
         return motion if seen.readout is not None and seen.readout.is_by_imu else motion.with_any_velocity()
 
     def _scale_covariance(self, ref_T_cur: Float) -> Float:

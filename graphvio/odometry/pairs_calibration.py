@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import ImuFaultTolerant, StateEstimator
 from graphvio.config import Config
+from graphvio.frontend.depth.tracks import TrackedFrame
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import so3_log
 from graphvio.measurements.estimate import Status
@@ -30,6 +31,19 @@ from graphvio.self_calibration.parameters import n_camera_parameters
 _MAX_TURN_RAD = np.deg2rad(0.3)  # a larger correction of the cameras' attitude begins a new keyframe
 _DISTRUST_SIGMAS = 5.0  # if an IMU parameter changes by more than this, predictions made before are wrong
 _AVERAGED = 100  # number of samples whose mean specific force is about that of gravity
+_MAX_WAIT_NS = 500_000_000  # of a frameset with rolling shutters, for the motion after it
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A frameset that may become a keyframe of the calibration; see `SelfCalibration.add_frameset`."""
+
+    stamp_ns: int
+    instant_ns: int
+    odom_T_body: Float
+    frames: dict[int, TrackedFrame]
+    are_contradicting: bool
+    is_urgent: bool
 
 
 class PairsCalibration:
@@ -70,6 +84,8 @@ class PairsCalibration:
         self._calibration = SelfCalibration(rig)
         self._motion: RelativeMotion | None = None  # motion by vision at the newest frameset
         self._are_contradicting = False  # whether several motions are seen there
+        self._is_motion_needed = rig.imu is None and any(camera.line_time_us for camera in rig.cameras)
+        self._waiting: list[_Candidate] = []  # for the motion after them
         self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
         self._in_force = np.zeros_like(self.estimate.difference)  # difference of the calibration from the rig file
@@ -126,9 +142,11 @@ class PairsCalibration:
         instant_ns = self._synchroniser.instant_ns(stamp_ns)
         if estimator.epoch != self._epoch:
             self._epoch = estimator.epoch
+            self._waiting = []
             calibration.start_window()
         motion = self._motion if status in (Status.TRACKING, Status.INITIALISING) else None
-        calibration.add_motion(stamp_ns, instant_ns, estimator.state().nav_T_body, motion, references)
+        needed = references | {each.stamp_ns for each in self._waiting}
+        calibration.add_motion(stamp_ns, instant_ns, estimator.state().nav_T_body, motion, needed)
         if self._innovation_covariance is not None:
             self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.upper_covariance)
         is_urgent = self._frontend.are_lines_off
@@ -139,11 +157,14 @@ class PairsCalibration:
             return
         if calibration.is_first_window_doubted and quality is Quality.WEAK and not self._are_contradicting:
             return  # the images are at fault, and not the calibration
-        views = views_of(self._frontend.compensated_frames_at(stamp_ns))
+        frames = self._frontend.compensated_frames_at(stamp_ns)
         tolerant = self._imu_fault_tolerant
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)
-        calibration.add_frameset(instant_ns, pose, views, quality is Quality.WEAK, is_urgent)
+        candidate = _Candidate(stamp_ns, instant_ns, pose, frames, quality is Quality.WEAK, is_urgent)
+        for each in self._compensated(candidate) if self._is_motion_needed else [candidate]:
+            views = views_of(each.frames)
+            calibration.add_frameset(each.instant_ns, each.odom_T_body, views, each.are_contradicting, each.is_urgent)
 
     def update(self, stamp_ns: int) -> Float | None:
         """Pass cameras to the front-end, and the IMU's scale, axes and time offset to the synchroniser."""
@@ -186,6 +207,22 @@ class PairsCalibration:
     def close(self) -> None:
         """Stop the thread of the adjustments."""
         self._calibration.close()
+
+    def _compensated(self, newest: _Candidate) -> list[_Candidate]:
+        """Add a candidate to those that wait, and return those whose motion is known by now.
+
+        Without an IMU, the velocity at a frameset, by which its rolling shutters are compensated, is only known well
+        after the next one. At first it lags behind each acceleration; in the window, that looks like wrong cameras.
+        """
+        self._waiting = [each for each in self._waiting if newest.stamp_ns - each.stamp_ns <= _MAX_WAIT_NS] + [newest]
+        known = []
+        for each in self._waiting:
+            frames = self._frontend.compensated_by_both_sides(each.stamp_ns, each.frames)
+            if frames is None:
+                break
+            known.append(replace(each, frames=frames))
+        del self._waiting[: len(known)]
+        return known
 
     def _correct_imu(self) -> None:
         """Let the synchroniser correct samples with the calibration that is in force."""

@@ -89,10 +89,10 @@ class MotionGains:
         self._forget(references, since_ns)
         self._framesets[stamp_ns] = _Frameset(instant_ns, PoseGain(odom_T_body, gain))
 
-    def note_keyframe(self) -> None:
-        """Keep the newest frameset, which is a keyframe of the calibration."""
-        if self._framesets:
-            next(reversed(self._framesets.values())).is_keyframe = True
+    def note_keyframe(self, instant_ns: int) -> None:
+        """Keep the frameset of an instant, which is a keyframe of the calibration."""
+        for each in self._framesets.values():
+            each.is_keyframe |= each.instant_ns == instant_ns
 
     def since(self, instant_ns: int) -> PoseGain | None:
         """Return how the newest pose depends on the calibration since a keyframe, or None if it is not known."""

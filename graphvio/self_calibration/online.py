@@ -165,7 +165,7 @@ class SelfCalibration:
                 return
         self._agreeing += not are_contradicting
         self._collector.add(stamp_ns, odom_T_body, views)
-        self._gains.note_keyframe()
+        self._gains.note_keyframe(stamp_ns)
         if is_urgent:
             self._adjust_when_due()
             self._due_in = 0

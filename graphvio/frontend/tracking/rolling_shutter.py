@@ -38,6 +38,8 @@ class ReadoutMotion:
         force: (3,) m/s^2 specific force, which the accelerometer measures, at the stamp, frame body at the stamp:
             acceleration less gravity. Zero where no IMU measures it.
         velocity_covariance: (3, 3) of the velocity, (m/s)^2, or None where the velocity is only a guess.
+        angular_velocity_sigma: Standard deviation of the angular velocity about each axis, rad/s, where vision has
+            measured it.
         is_by_imu: Whether an IMU has measured rotation and acceleration.
     """
 
@@ -49,6 +51,7 @@ class ReadoutMotion:
     jerk: Float = field(default_factory=lambda: np.zeros(3))
     force: Float = field(default_factory=lambda: np.zeros(3))
     velocity_covariance: Float | None = None
+    angular_velocity_sigma: float = 0.0
     is_by_imu: bool = False
 
     @staticmethod
