@@ -1,6 +1,6 @@
 """Self-calibration on tracks without images: what it finds, how certain it is, and what it must leave alone."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from walked_views import Walk, calibrated, true_difference
+from walked_views import RATE_HZ, Walk, calibrated, true_difference
 
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import LEVELS
@@ -643,6 +643,79 @@ def test_self_calibration_takes_another_window_if_pairs_never_agreed_under_the_f
     assert calibration.has_full_window
     assert not calibration.estimate.is_file_exact
     assert calibration.is_confirmed == (not has_agreed)
+
+
+def with_contradictions(
+    walk: Walk, seconds: float, contradicts: Callable[[float, SelfCalibration], bool]
+) -> SelfCalibration:
+    """Calibrate an exact file, and say at each instant whether the pairs contradict each other."""
+    calibration = SelfCalibration(default_rig().without_imu())
+    for stamp_ns, pose, views in walk.framesets(seconds):
+        calibration.update()
+        are_contradicting = contradicts(1e-9 * stamp_ns, calibration)
+        calibration.note_contradiction(stamp_ns, are_contradicting)
+        calibration.add_frameset(stamp_ns, pose, views, are_contradicting)
+    calibration.close()
+    return calibration
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.3])
+def test_self_calibration_after_a_knock_that_no_epipolar_line_shows_finds_it_if_contradictions_last(
+    pause_s: float,
+) -> None:
+    """A right camera turns towards the left one: pairs contradict each other, with pauses, until that is known."""
+    rig = default_rig().without_imu()
+    pair = rig.pairs[0]
+    turned = pair.right.body_T_cam @ se3_exp(np.deg2rad([0.0, 0.15, 0.0, 0.0, 0.0, 0.0]))
+    knocked = replace(rig, pairs=(replace(pair, right=replace(pair.right, body_T_cam=turned)), *rig.pairs[1:]))
+    walk = Walk(rig)
+
+    def contradicts(time_s: float, calibration: SelfCalibration) -> bool:
+        if time_s >= 6.0:
+            walk.rig = knocked
+        return time_s >= 6.0 and not calibration.restarts and time_s % 1.0 >= pause_s
+
+    found = with_contradictions(walk, 24.0, contradicts)
+    assert found.restarts == 1
+    right_T_left = found.estimate.rig.pairs[0].right_T_left
+    off = so3_log(np.ascontiguousarray(right_T_left[:3, :3] @ knocked.pairs[0].right_T_left[:3, :3].T))
+    assert np.rad2deg(np.abs(off)).max() < 0.01
+
+
+def test_self_calibration_takes_no_short_contradictions_for_a_knock() -> None:
+    rig = default_rig().without_imu()
+    doubts = []
+
+    def contradicts(time_s: float, calibration: SelfCalibration) -> bool:
+        doubts.append(calibration.is_doubted)
+        return time_s >= 6.0 and time_s % 3.0 < 2.0
+
+    found = with_contradictions(Walk(rig), 14.0, contradicts)
+    assert not any(doubts[-100:])
+    assert found.restarts == 0
+    assert found.estimate.is_file_exact
+
+
+class Door(Walk):
+    """From 6 s on, the second pair sees nothing but points that move to one side together."""
+
+    _framesets, _moved = 0, np.zeros(3)
+
+    def views(self, world_T_body: Float) -> dict[int, View]:
+        found, points = super().views(world_T_body), self._points
+        self._framesets += 1
+        if self._framesets > 6.0 * RATE_HZ:
+            self._moved = self._moved + np.array([0.01, 0.005, 0.0])
+            self._points = points + self._moved
+            found[1] = super().views(world_T_body)[1]
+            self._points = points
+        return found
+
+
+@pytest.mark.parametrize("walk", [Crowd, Door])
+def test_self_calibration_takes_no_lasting_contradiction_by_the_scene_for_a_knock(walk: type[Walk]) -> None:
+    found = with_contradictions(walk(default_rig().without_imu()), 34.0, lambda time_s, _: time_s >= 6.0)
+    assert found.restarts == 0
 
 
 def known_cameras(rig: Rig) -> Float:

@@ -149,13 +149,15 @@ class PairsCalibration:
         calibration.add_motion(stamp_ns, instant_ns, estimator.state().nav_T_body, motion, needed)
         if self._innovation_covariance is not None:
             self._innovation_covariance.add_frameset(stamp_ns, estimator, references, calibration.upper_covariance)
+        if self._motion is not None:
+            calibration.note_contradiction(stamp_ns, self._are_contradicting)
         is_urgent = self._frontend.are_lines_off
         # Until the calibration is trusted, motions may be refused because of it.
         is_refused = status is Status.COASTING and not calibration.is_trusted
         is_usable = quality is not Quality.FAILED and (status in (Status.TRACKING, Status.INITIALISING) or is_refused)
         if not (is_usable or is_urgent) or not self._frontend.are_velocities_known:
             return
-        if calibration.is_first_window_doubted and quality is Quality.WEAK and not self._are_contradicting:
+        if calibration.is_doubted and quality is Quality.WEAK and not self._are_contradicting:
             return  # the images are at fault, and not the calibration
         frames = self._frontend.compensated_frames_at(stamp_ns)
         tolerant = self._imu_fault_tolerant

@@ -36,6 +36,8 @@ _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _MAX_SIGMAS = 4.0  # of a parameter, in the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed: later contradictions are attributed to the scene
 _MAX_REFUSED = 3  # full windows
+# Pairs that contradict each other for longer than this, without a pause of agreement, may have been moved.
+_MAX_CONTRADICTION_NS, _MIN_AGREEMENT_NS = 3_000_000_000, 500_000_000
 _MIN_CONFIRMING = 2  # full windows; one is at times off by more than its covariance says
 WALK = 0.01  # random walk in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # longest duration of the random walk over one window
@@ -56,6 +58,8 @@ _PACES = (
     _Pace((8, WINDOW), 0.25, 8),
 )
 """Paces of the first windows; the last one is also that of all later windows."""
+_MAX_NOISE_RATIO = 1.4  # of a window that its calibration explains, to the noise of the windows before
+_PACE_IN_DOUBT = 1  # of windows that are to show whether cameras have been moved
 
 
 class SelfCalibration:
@@ -100,6 +104,8 @@ class SelfCalibration:
         self._in_force_covariance = self._prior.covariance[: self._n_camera_parameters, : self._n_camera_parameters]
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes whose pairs agreed, before the first window or since
+        self._contradicting_ns: tuple[int, int] | None = None  # stamps of the first and the newest frameset that does
+        self._is_contradiction_lasting = False
         self._refused = 0  # full windows, one after the other
         self._implausible: list[Gaussian] = []  # calibrations of full windows by which the file is implausibly wrong
         self._are_cameras_beyond_any = False  # whether two full windows agree that the file's cameras are so wrong
@@ -136,6 +142,23 @@ class SelfCalibration:
         """Add the motion of a frameset, before `add_frameset`; for arguments see `MotionGains.add`."""
         self._gains.add(stamp_ns, instant_ns, odom_T_body, motion, references, self._consider.newest_ns)
 
+    def note_contradiction(self, stamp_ns: int, are_contradicting: bool) -> None:
+        """Record whether the pairs contradict each other at a frameset: if that lasts, cameras may have been moved.
+
+        The unfinished window is discarded then: it may have keyframes from before.
+        """
+        first_ns, newest_ns = self._contradicting_ns or (stamp_ns, stamp_ns)
+        if are_contradicting:
+            self._contradicting_ns = first_ns, stamp_ns
+        elif stamp_ns - newest_ns > _MIN_AGREEMENT_NS:
+            self._contradicting_ns = None
+        lasted, lasts = self._is_contradiction_lasting, self._contradicting_ns is not None
+        lasts = lasts and stamp_ns - first_ns > _MAX_CONTRADICTION_NS
+        self._is_contradiction_lasting = lasts
+        if lasts and not lasted and self.is_trusted:
+            self._collector.begin_window()
+            self._adjusted_at = 0
+
     def add_frameset(
         self,
         stamp_ns: int,
@@ -161,7 +184,7 @@ class SelfCalibration:
         if self.is_trusted:
             if knocked := self._knocked(views):
                 self._forget_extrinsics(knocked)
-            elif are_contradicting and not self.is_first_window_doubted:
+            elif are_contradicting and not self.is_doubted:
                 return
         self._agreeing += not are_contradicting
         self._collector.add(stamp_ns, odom_T_body, views)
@@ -220,6 +243,14 @@ class SelfCalibration:
         return len(self._rig.groups) > 1 and self._used_windows == 1 and self._agreeing < _MIN_AGREEING
 
     @property
+    def is_doubted(self) -> bool:
+        """Whether contradictions of pairs are attributed to the calibration although it is trusted.
+
+        The first window may be wrong, or cameras may have been moved.
+        """
+        return self.is_first_window_doubted or self._is_contradiction_lasting
+
+    @property
     def _n_camera_parameters(self) -> int:
         """Number of the cameras' parameters, the first ones of all."""
         return n_camera_parameters(self._rig)
@@ -248,13 +279,15 @@ class SelfCalibration:
 
     @property
     def _pace(self) -> _Pace:
-        return _PACES[min(self._full_windows, len(_PACES) - 1)]
+        latest = _PACE_IN_DOUBT if self._is_contradiction_lasting else len(_PACES) - 1
+        return _PACES[min(self._full_windows, latest)]
 
     def _is_acceptable(self, adjusted: AdjustedWindow) -> bool:
         """Return whether an adjustment may come into force; one that contradicts those before it counts as refused."""
         calibration = adjusted.solution.calibration
         if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
-            self._refuse(adjusted.is_full)
+            # While pairs contradict each other, the cause may be something that moves in a view: it fits no calibration.
+            self._refuse(adjusted.is_full and (not self._is_contradiction_lasting or self._fits(adjusted)))
             return False
         if not self._is_plausible(calibration, adjusted.is_full):
             return False
@@ -320,9 +353,14 @@ class SelfCalibration:
             return []
         return self._knocks.update(views, self._in_force, self._in_force_covariance)
 
-    def _refuse(self, is_full: bool) -> None:
-        """Discard a window that contradicts those before it; three full ones in succession are taken as a knock."""
-        self._refused += is_full
+    def _fits(self, adjusted: AdjustedWindow) -> bool:
+        """Return whether a window's calibration explains its views, with the noise of the windows before."""
+        shown_px = pixel_noise(adjusted.solution.errors2, adjusted.solution.window.tracks.sigma_px[:, None])
+        return shown_px < _MAX_NOISE_RATIO * self._sigma_px
+
+    def _refuse(self, counts: bool) -> None:
+        """Discard a window that contradicts those before it; three that count, in succession, are taken as a knock."""
+        self._refused += counts
         if self._refused >= _MAX_REFUSED:
             self._forget_extrinsics(range(len(self._rig.groups)))
 
