@@ -286,7 +286,7 @@ class SelfCalibration:
         """Return whether an adjustment may come into force; one that contradicts those before it counts as refused."""
         calibration = adjusted.solution.calibration
         if self.has_full_window and not adjusted.prior.is_confirmed_by(calibration):
-            # While pairs contradict each other, the cause may be something that moves in a view: it fits no calibration.
+            # While pairs contradict each other, the cause may be what moves in a view: it fits no calibration.
             self._refuse(adjusted.is_full and (not self._is_contradiction_lasting or self._fits(adjusted)))
             return False
         if not self._is_plausible(calibration, adjusted.is_full):
