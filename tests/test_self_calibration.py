@@ -697,14 +697,14 @@ def test_self_calibration_takes_no_short_contradictions_for_a_knock() -> None:
 
 
 class Door(Walk):
-    """From 6 s on, the second pair sees nothing but points that move to one side together."""
+    """From an instant on, the second pair sees nothing but points that move to one side together."""
 
-    _framesets, _moved = 0, np.zeros(3)
+    begin_s, _framesets, _moved = 6.0, 0, np.zeros(3)
 
     def views(self, world_T_body: Float) -> dict[int, View]:
         found, points = super().views(world_T_body), self._points
         self._framesets += 1
-        if self._framesets > 6.0 * RATE_HZ:
+        if self._framesets > self.begin_s * RATE_HZ:
             self._moved = self._moved + np.array([0.01, 0.005, 0.0])
             self._points = points + self._moved
             found[1] = super().views(world_T_body)[1]
@@ -716,6 +716,23 @@ class Door(Walk):
 def test_self_calibration_takes_no_lasting_contradiction_by_the_scene_for_a_knock(walk: type[Walk]) -> None:
     found = with_contradictions(walk(default_rig().without_imu()), 34.0, lambda time_s, _: time_s >= 6.0)
     assert found.restarts == 0
+
+
+def test_self_calibration_takes_no_door_before_the_first_full_window_for_a_wrong_file() -> None:
+    walk = Door(default_rig().without_imu())
+    walk.begin_s = 1.0
+    assert with_contradictions(walk, 12.0, lambda time_s, _: time_s >= 1.0).estimate.is_file_exact
+
+
+def test_self_calibration_takes_contradictions_before_and_after_a_gap_for_two() -> None:
+    calibration = calibrated(SelfCalibration(default_rig().without_imu()), Walk(default_rig().without_imu()), 6.0)
+    assert calibration.is_confirmed
+    for second in (0, 10):
+        calibration.note_contradiction(second * 1_000_000_000, True)
+    assert not calibration.is_doubted
+    for k in range(40):
+        calibration.note_contradiction(10_000_000_000 + k * 100_000_000, True)
+    assert calibration.is_doubted
 
 
 def known_cameras(rig: Rig) -> Float:

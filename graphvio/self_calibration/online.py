@@ -145,19 +145,20 @@ class SelfCalibration:
     def note_contradiction(self, stamp_ns: int, are_contradicting: bool) -> None:
         """Record whether the pairs contradict each other at a frameset: if that lasts, cameras may have been moved.
 
-        The unfinished window is discarded then: it may have keyframes from before.
+        This is considered only once full windows have confirmed the calibration. When a contradiction begins to last,
+        or ends, the unfinished window is discarded, so that none has keyframes of both times.
         """
-        first_ns, newest_ns = self._contradicting_ns or (stamp_ns, stamp_ns)
-        if are_contradicting:
-            self._contradicting_ns = first_ns, stamp_ns
-        elif stamp_ns - newest_ns > _MIN_AGREEMENT_NS:
+        if self._contradicting_ns is not None and stamp_ns - self._contradicting_ns[1] > _MIN_AGREEMENT_NS:
             self._contradicting_ns = None
-        lasted, lasts = self._is_contradiction_lasting, self._contradicting_ns is not None
-        lasts = lasts and stamp_ns - first_ns > _MAX_CONTRADICTION_NS
-        self._is_contradiction_lasting = lasts
-        if lasts and not lasted and self.is_trusted:
+        if are_contradicting:
+            first_ns = stamp_ns if self._contradicting_ns is None else self._contradicting_ns[0]
+            self._contradicting_ns = first_ns, stamp_ns
+        lasts = self._contradicting_ns is not None and stamp_ns - self._contradicting_ns[0] > _MAX_CONTRADICTION_NS
+        lasts = lasts and self.is_confirmed
+        if lasts != self._is_contradiction_lasting and self.is_confirmed:
             self._collector.begin_window()
             self._adjusted_at = 0
+        self._is_contradiction_lasting = lasts
 
     def add_frameset(
         self,
@@ -203,6 +204,7 @@ class SelfCalibration:
 
     def start_window(self) -> None:
         """Discard the unfinished window: later poses are in another frame."""
+        self._contradicting_ns, self._is_contradiction_lasting = None, False
         self._gains.restart()
         self._discard_window()
 
@@ -375,6 +377,7 @@ class SelfCalibration:
         self._collector.begin_window()
         self._adjusted_at = self._full_windows = 0
         self._used_windows, self._agreeing, self._refused = 0, 0, 0
+        self._contradicting_ns, self._is_contradiction_lasting = None, False
         self._knocks = KnockDetector()  # offsets by another calibration are not comparable
         self.restarts += 1
         self._consider.forget()
