@@ -84,7 +84,7 @@ class PairsCalibration:
         self._calibration = SelfCalibration(rig)
         self._motion: RelativeMotion | None = None  # motion by vision at the newest frameset
         self._are_contradicting = False  # whether several motions are seen there
-        self._is_motion_needed = rig.imu is None and any(camera.line_time_us for camera in rig.cameras)
+        self._waits_for_next_motion = rig.imu is None and any(camera.line_time_us for camera in rig.cameras)
         self._waiting: list[_Candidate] = []  # for the motion after them
         self._innovation_covariance = None if rig.imu is None else CalibrationInnovationCovariance(rig)
         self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
@@ -164,7 +164,7 @@ class PairsCalibration:
         pose = estimator.state().nav_T_body if tolerant is None else tolerant.pose_by_vision()
         calibration.note_stamps(self._synchroniser.stamp_sigma_s)
         candidate = _Candidate(stamp_ns, instant_ns, pose, frames, quality is Quality.WEAK, is_urgent)
-        for each in self._compensated(candidate) if self._is_motion_needed else [candidate]:
+        for each in self._compensated(candidate) if self._waits_for_next_motion else [candidate]:
             views = views_of(each.frames)
             calibration.add_frameset(each.instant_ns, each.odom_T_body, views, each.are_contradicting, each.is_urgent)
 

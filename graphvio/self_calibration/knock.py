@@ -1,4 +1,4 @@
-"""Detection of a knock that turns a camera, by matches that all leave their epipolar lines at once."""
+"""Signs of a knock: matches that all leave their epipolar lines, and pairs that contradict each other for long."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ _MAX_OFFSET_PX = 0.25  # median; a calibration that is well known is off by a te
 _MAX_SIGMAS = 4.0  # of the offset, by the calibration's covariance: elsewhere in an image it may be known less well
 _CONFIRMED = 3  # keyframes, one after the other
 _MAX_CHANGE = 0.2  # relative, between these keyframes: a turned camera's offset stays, a late camera's does not
+# Pairs that contradict each other for longer than this, without a pause of agreement, may have been moved.
+_MAX_CONTRADICTION_NS, _MIN_AGREEMENT_NS = 3_000_000_000, 500_000_000
 _TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # standard deviations of what a knock does to a camera or a pair
 
 
@@ -51,6 +53,28 @@ class KnockDetector:
         for j in knocked:
             del self._off_px[j]
         return knocked
+
+
+class Contradiction:
+    """Monitors for how long the pairs have contradicted each other."""
+
+    def __init__(self) -> None:
+        self._contradicting_ns: tuple[int, int] | None = None  # stamps of the first and the newest frameset that does
+        self._now_ns = 0
+
+    def update(self, stamp_ns: int, are_contradicting: bool) -> None:
+        """Add a frameset with a measured motion; a long agreement or a gap ends the contradiction before it."""
+        self._now_ns = stamp_ns
+        if self._contradicting_ns is not None and stamp_ns - self._contradicting_ns[1] > _MIN_AGREEMENT_NS:
+            self._contradicting_ns = None
+        if are_contradicting:
+            first_ns = stamp_ns if self._contradicting_ns is None else self._contradicting_ns[0]
+            self._contradicting_ns = first_ns, stamp_ns
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the pairs have contradicted each other for more than three seconds."""
+        return self._contradicting_ns is not None and self._now_ns - self._contradicting_ns[0] > _MAX_CONTRADICTION_NS
 
 
 def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float | None:

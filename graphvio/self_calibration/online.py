@@ -24,7 +24,7 @@ from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import MAX_FACTOR, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
-from graphvio.self_calibration.knock import KnockDetector, knock_covariance
+from graphvio.self_calibration.knock import Contradiction, KnockDetector, knock_covariance
 from graphvio.self_calibration.motion_gains import MotionGains, PoseGain
 from graphvio.self_calibration.parameters import RigCalibration, n_camera_parameters, parameter_names
 from graphvio.self_calibration.pixel_noise import pixel_noise
@@ -36,8 +36,6 @@ _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _MAX_SIGMAS = 4.0  # of a parameter, in the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed: later contradictions are attributed to the scene
 _MAX_REFUSED = 3  # full windows
-# Pairs that contradict each other for longer than this, without a pause of agreement, may have been moved.
-_MAX_CONTRADICTION_NS, _MIN_AGREEMENT_NS = 3_000_000_000, 500_000_000
 _MIN_CONFIRMING = 2  # full windows; one is at times off by more than its covariance says
 WALK = 0.01  # random walk in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # longest duration of the random walk over one window
@@ -104,8 +102,7 @@ class SelfCalibration:
         self._in_force_covariance = self._prior.covariance[: self._n_camera_parameters, : self._n_camera_parameters]
         self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes whose pairs agreed, before the first window or since
-        self._contradicting_ns: tuple[int, int] | None = None  # stamps of the first and the newest frameset that does
-        self._is_contradiction_lasting = False
+        self._contradiction = Contradiction()
         self._refused = 0  # full windows, one after the other
         self._implausible: list[Gaussian] = []  # calibrations of full windows by which the file is implausibly wrong
         self._are_cameras_beyond_any = False  # whether two full windows agree that the file's cameras are so wrong
@@ -148,17 +145,10 @@ class SelfCalibration:
         This is considered only once full windows have confirmed the calibration. When a contradiction begins to last,
         or ends, the unfinished window is discarded, so that none has keyframes of both times.
         """
-        if self._contradicting_ns is not None and stamp_ns - self._contradicting_ns[1] > _MIN_AGREEMENT_NS:
-            self._contradicting_ns = None
-        if are_contradicting:
-            first_ns = stamp_ns if self._contradicting_ns is None else self._contradicting_ns[0]
-            self._contradicting_ns = first_ns, stamp_ns
-        lasts = self._contradicting_ns is not None and stamp_ns - self._contradicting_ns[0] > _MAX_CONTRADICTION_NS
-        lasts = lasts and self.is_confirmed
-        if lasts != self._is_contradiction_lasting and self.is_confirmed:
-            self._collector.begin_window()
-            self._adjusted_at = 0
-        self._is_contradiction_lasting = lasts
+        lasted = self._is_contradiction_lasting
+        self._contradiction.update(stamp_ns, are_contradicting)
+        if self._is_contradiction_lasting != lasted:
+            self._discard_window()
 
     def add_frameset(
         self,
@@ -204,7 +194,7 @@ class SelfCalibration:
 
     def start_window(self) -> None:
         """Discard the unfinished window: later poses are in another frame."""
-        self._contradicting_ns, self._is_contradiction_lasting = None, False
+        self._contradiction = Contradiction()
         self._gains.restart()
         self._discard_window()
 
@@ -243,6 +233,11 @@ class SelfCalibration:
     def is_first_window_doubted(self) -> bool:
         """Whether the pairs have hardly agreed under the calibration of the first window, which may then be wrong."""
         return len(self._rig.groups) > 1 and self._used_windows == 1 and self._agreeing < _MIN_AGREEING
+
+    @property
+    def _is_contradiction_lasting(self) -> bool:
+        """Whether pairs contradict each other for so long, by a confirmed calibration, that cameras may have moved."""
+        return self.is_confirmed and self._contradiction.lasts
 
     @property
     def is_doubted(self) -> bool:
@@ -361,7 +356,10 @@ class SelfCalibration:
         return shown_px < _MAX_NOISE_RATIO * self._sigma_px
 
     def _refuse(self, counts: bool) -> None:
-        """Discard a window that contradicts those before it; three that count, in succession, are taken as a knock."""
+        """Discard a window that contradicts those before it; three that count are taken as a knock.
+
+        A window that comes into force in between ends the count.
+        """
         self._refused += counts
         if self._refused >= _MAX_REFUSED:
             self._forget_extrinsics(range(len(self._rig.groups)))
@@ -377,7 +375,7 @@ class SelfCalibration:
         self._collector.begin_window()
         self._adjusted_at = self._full_windows = 0
         self._used_windows, self._agreeing, self._refused = 0, 0, 0
-        self._contradicting_ns, self._is_contradiction_lasting = None, False
+        self._contradiction = Contradiction()
         self._knocks = KnockDetector()  # offsets by another calibration are not comparable
         self.restarts += 1
         self._consider.forget()
