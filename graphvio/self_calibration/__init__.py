@@ -14,8 +14,8 @@ normal equations of the landmarks (`observation`, `moving_landmarks`, `pixel_noi
 
 *All windows.* `evidence` adds up the information of all windows, and estimates how wrong the rig file is;
 `window_adjustment` adjusts one window, given those before. `findings` compares the result with the rig file, part by
-part, `curves` prepares it for plots, and `estimate` holds all that is known at one moment. `knock` detects a camera
-that was turned.
+part, `curves` prepares it for plots, and `estimate` holds all that is known at one moment. `knock` detects cameras
+that were turned or moved.
 
 *Elsewhere.* `consider` and `motion_gains` compute what errors of the calibration add to the pose's covariance, and
 `innovation` what they add to that of the innovation test. `batch` calibrates from a whole recording.
