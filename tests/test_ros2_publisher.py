@@ -103,6 +103,8 @@ class System:
         self.publisher = Publisher(self.running, domain, frames=Frames(BASE_T_BODY))
         self.other = Other("slam", domain)
         assert self.other.read() == "True"
+        writers = self.publisher._writers.values()  # they find their readers later than readers find them
+        assert until(lambda: all(each.readers for each in writers))
         self._taken: dict[str, list[Any]] = {}
 
     def all_of(self, topic: str) -> list[Any]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from calibration_walks import recorded
+from monte_carlo import band
 from test_optimize import SECONDS, to_and_fro
 
 from graphvio import Config, Odometry, open_source
@@ -27,6 +28,8 @@ CONFIG = Config.from_yaml(
     "keyframes: {images: true, descriptors: none}}"
 )
 _POLL_S = 0.002
+_MAX_ERROR_SHARES = {"cam0": 0.7, "cam0,cam2": 0.25}
+"""Cameras -> error in the map by that of the odometry; with six seeds of the noise it was 0.24-0.57 and 0.07-0.17."""
 
 
 @dataclass(eq=False)
@@ -58,13 +61,14 @@ class Paced:
 class Walked:
     """A walk: keyframes, their true poses (N, 4, 4), poses in the map, and the odometry's correction at the end."""
 
+    max_error_share: float
     front_end: Paced
     truth: Float
     in_map: Float
     closures_used: int
 
 
-@pytest.fixture(scope="module", params=["cam0", "cam0,cam2"])
+@pytest.fixture(scope="module", params=list(_MAX_ERROR_SHARES))
 def walked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Walked:
     path = recorded(tmp_path_factory.mktemp("slam") / "walk", SECONDS, to_and_fro)
     rig = open_source(path).rig.with_only(request.param.split(",")).without_pairs()
@@ -83,7 +87,7 @@ def walked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     assert is_known.all()
     assert len(mapper.trajectory) == len(stamps)
     used = sum(is_used for _, is_used in mapper.closures)
-    return Walked(paced, truth.nav_T_body, mapper.trajectory.nav_T_body, used)
+    return Walked(_MAX_ERROR_SHARES[request.param], paced, truth.nav_T_body, mapper.trajectory.nav_T_body, used)
 
 
 def squared(measured: Float, true: Float, covariance: Float) -> float:
@@ -115,16 +119,15 @@ def test_corrections_are_accepted_and_consistent(walked: Walked) -> None:
     for number, map_T_body, covariance, result in walked.front_end.corrections:
         assert result.accepted
         squares.append(squared(map_T_body, odom_T_world @ walked.truth[number], covariance))
-    assert np.mean(squares) < 9.0
+    assert np.mean(squares) < band(1)[1]  # the corrections of one walk share most of their error: one sample
     assert walked.front_end.front_end.map_T_odom is not None
 
 
 def test_map_is_more_accurate_than_odometry(walked: Walked) -> None:
     assert walked.closures_used >= 5
     online = np.array([each.odom_T_body for each in walked.front_end.made])
-    assert np.sqrt((off_m(walked.in_map, walked.truth) ** 2).mean()) < 0.5 * np.sqrt(
-        (off_m(online, walked.truth) ** 2).mean()
-    )
+    in_map_m, online_m = (np.sqrt((off_m(each, walked.truth) ** 2).mean()) for each in (walked.in_map, online))
+    assert in_map_m < walked.max_error_share * online_m
 
 
 def test_landmarks_are_consistent_with_their_pixels(walked: Walked) -> None:
