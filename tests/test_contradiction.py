@@ -13,7 +13,9 @@ SET = tuple[tuple[int, ...], float]
 """Pairs of a motion hypothesis, and the statistic of its innovation test."""
 
 
-def chosen(contradiction: Contradiction, hypotheses: list[SET], *, has_imu: bool = False) -> tuple[int, ...]:
+def chosen(
+    contradiction: Contradiction, hypotheses: list[SET], *, has_imu: bool = False, followed: tuple[int, ...] = ()
+) -> tuple[int, ...]:
     """Return the pairs whose motion is used; of hypotheses that cover each other, none."""
     statistics = dict(hypotheses)
 
@@ -24,7 +26,7 @@ def chosen(contradiction: Contradiction, hypotheses: list[SET], *, has_imu: bool
     motions = tuple(RelativeMotion(0, 1, np.eye(4), np.eye(6), np.eye(6), 100, pairs=pairs) for pairs in statistics)
     covering = RelativeMotion(0, 1, np.eye(4), 100.0 * np.eye(6), np.eye(6), 100)
     visual = VisualResult(covering, Quality.WEAK, "two motions", {}, alternatives=motions)
-    motion, result = contradiction.resolve(visual, gate, has_imu)
+    motion, result = contradiction.resolve(visual, gate, has_imu, followed)
     assert result.statistic == gate(motion).statistic
     return motion.pairs
 
@@ -63,3 +65,11 @@ def test_contradiction_with_imu_takes_what_it_accepts_alone() -> None:
     assert chosen(Contradiction(), [((0,), 90.0), ((1,), 5.0)], has_imu=True) == (1,)
     assert chosen(Contradiction(), [((0,), 20.0), ((1,), 1.0)], has_imu=True) == ()
     assert chosen(Contradiction(), [((0,), 40.0), ((1,), 20.0)], has_imu=True) == ()
+
+
+def test_contradiction_with_imu_takes_the_followed_pairs_where_it_accepts_all() -> None:
+    both: list[SET] = [((0,), 5.0), ((1,), 6.0)]
+    assert chosen(Contradiction(), both, has_imu=True, followed=(1,)) == (1,)
+    assert chosen(Contradiction(), both, has_imu=True, followed=(2,)) == ()
+    assert chosen(Contradiction(), [((0,), 5.0), ((1,), 30.0)], has_imu=True, followed=(1,)) == ()
+    assert chosen(Contradiction(), [((0,), 5.0), ((1,), 90.0)], has_imu=True, followed=(1,)) == (0,)

@@ -11,11 +11,11 @@ _MIN_LIKELIER = 6.0  # difference of chi-square statistics that decides without 
 class Contradiction:
     """Chooses between motion hypotheses by comparing them with the state estimator's prediction.
 
-    With an IMU, the innovation test rejects a motion that is not the rig's. Without one, the prediction is constant
-    velocity, and the test rejects hardly any motion; but an object that comes into one view and moves changes that
-    view's velocity at once, while the velocity of the other views continues. So the first frameset with a contradiction
-    decides, and the pairs chosen there are followed as long as the contradiction lasts: later, an object's velocity is
-    as constant as the rig's.
+    With an IMU, the innovation test rejects a motion that is not the rig's; where it accepts all of them, their motions
+    over a longer time decide. Without an IMU, the prediction is constant velocity, and the test rejects hardly any
+    motion; but an object that comes into one view and moves changes that view's velocity at once, while the velocity of
+    the other views continues. So the first frameset with a contradiction decides, and the pairs chosen there are
+    followed as long as the contradiction lasts: later, an object's velocity is as constant as the rig's.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,11 @@ class Contradiction:
         self._followed: frozenset[int] = frozenset()
 
     def resolve(
-        self, visual: VisualResult, gate: Callable[[RelativeMotion], GateResult], has_imu: bool
+        self,
+        visual: VisualResult,
+        gate: Callable[[RelativeMotion], GateResult],
+        has_imu: bool,
+        followed: tuple[int, ...] = (),
     ) -> tuple[RelativeMotion, GateResult]:
         """Return the motion to use and its gate result.
 
@@ -31,6 +35,8 @@ class Contradiction:
             visual: Result of the visual front-end, with a motion.
             gate: Innovation test of the estimator.
             has_imu: Whether the prediction is by an IMU.
+            followed: Pairs that the IMU alone has agreed with until now, see `graphvio.backend.dead_reckoning`; none
+                where that is not decided.
         """
         assert visual.motion is not None
         tested = sorted(((gate(motion), motion) for motion in visual.alternatives), key=lambda each: each[0].statistic)
@@ -38,6 +44,9 @@ class Contradiction:
             (likely, motion), (unlikely, _) = tested[:2]
             if likely.accepted and not unlikely.accepted and likely.is_clear and unlikely.is_clear:
                 return motion, likely
+            for result, motion in tested:
+                if motion.pairs == followed and result.accepted:
+                    return motion, result
         elif tested:
             if not self._is_open:
                 self._followed = _clearly_predicted(tested)

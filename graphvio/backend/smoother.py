@@ -33,10 +33,17 @@ from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
 from graphvio.backend.readout_factor import corrected, jacobians_of, readout_factor
 from graphvio.backend.reference_views import ReferenceViews
-from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity, tilt_covariance
+from graphvio.backend.states import (
+    InitialUncertainty,
+    RigState,
+    StateCovariance,
+    certain_origin,
+    level_gravity,
+    tilt_covariance,
+)
 from graphvio.backend.window import SOLVER_ERRORS, GraphWindow
 from graphvio.config.stages import SmootherConfig
-from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, skew
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import ByVelocities, RelativeMotion
@@ -83,6 +90,26 @@ class Smoother:
     def latest_ns(self) -> int:
         """Stamp of the newest state."""
         return self._stamps[-1]
+
+    @property
+    def previous_ns(self) -> int | None:
+        """Stamp of the state before the newest one, or None if there is one state."""
+        return self._stamps[-2] if len(self._stamps) > 1 else None
+
+    def from_state(self, stamp_ns: int) -> Smoother:
+        """Return a smoother with only the state of a stamp, whose pose defines nav; for a smoother with an IMU."""
+        k, state = self._index_of[stamp_ns], self.state(stamp_ns)
+        joint = self._window.joint_covariance([x(k), v(k), b(k), g()])
+        of_inertial = np.hstack([np.zeros((12, 6)), np.eye(12)])
+        nav_R_body = state.nav_T_body[:3, :3]
+        for rows, vector in ((slice(0, 3), state.velocity_nav), (slice(9, 12), state.gravity_nav)):
+            of_inertial[rows, :3] = nav_R_body @ skew(nav_R_body.T @ vector)
+        uncertainty = InitialUncertainty(
+            certain_origin(), 0.0, 0.0, inertial=np.asarray(of_inertial @ joint @ of_inertial.T)
+        )
+        alone = Smoother(self._config, self._imu)
+        alone.initialise(stamp_ns, state, uncertainty)
+        return alone
 
     def initialise(self, stamp_ns: int, state: RigState, uncertainty: InitialUncertainty) -> None:
         """Replace the window by one with a single state."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.contradiction import Contradiction
+from graphvio.backend.dead_reckoning import DeadReckoning
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
 from graphvio.backend.imu_match import ImuMatch
 from graphvio.backend.initial_state import (
@@ -71,6 +72,7 @@ class SmootherEstimator:
         self._status = StatusMonitor(config.smoother.lost_position_sigma_m, report)
         self._smoother: Smoother | None = None
         self._contradiction = Contradiction()
+        self._dead_reckoning = DeadReckoning()
         self._reset_ns = 0
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._accepted = 0  # motions since the initialisation
@@ -171,6 +173,7 @@ class SmootherEstimator:
         before = self.state()
         try:
             self._running.extend(stamp_ns, interval)
+            self._dead_reckoning.predict(stamp_ns, interval)
         except SOLVER_ERRORS as error:
             self._rebuild(stamp_ns, before, error)
             return True
@@ -323,7 +326,9 @@ class SmootherEstimator:
             # The motion begins at a state that vision did not constrain.
             self._reinitialise_after_lost(motion)
             return MeasurementUpdate(motion, needs_keyframe=True)
-        motion, gate_result = self._contradiction.resolve(visual, self._running.gate, self.has_imu)
+        is_tested = self._is_predicted_by_imu and not self._is_imu_left_out
+        followed = self._dead_reckoning.pairs_to_follow(visual, smoother) if is_tested else ()
+        motion, gate_result = self._contradiction.resolve(visual, smoother.gate, self.has_imu, followed)
         if not gate_result.accepted and not self.has_imu:
             gate_result = smoother.gate(motion, _CONSTANT_VELOCITY_SCALE)
         self.gate_results["vision"] = gate_result
@@ -492,6 +497,7 @@ class SmootherEstimator:
         self._accepted = 0
         self._is_standstill_assumed = self._are_points_wrong = False
         self._running.initialise(initial.stamp_ns, initial.state, initial.uncertainty)
+        self._dead_reckoning = DeadReckoning()
         self._reset_ns = initial.stamp_ns
         self.initialisations += 1
         self._status.note_initialisation(initial)

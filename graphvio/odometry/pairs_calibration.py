@@ -132,6 +132,9 @@ class PairsCalibration:
     def with_calibration_covariance(self, visual: VisualResult) -> VisualResult:
         """Attach to each motion the innovation covariance that errors of the calibration add."""
         self._motion, self._are_contradicting = visual.motion, bool(visual.alternatives)
+        calibration = self._calibration
+        is_trusted = calibration.is_trusted and not calibration.is_first_window_doubted
+        visual = replace(visual, is_calibration_trusted=is_trusted)
         if self._innovation_covariance is None:
             return visual
         return self._innovation_covariance.with_calibration_covariance(visual, self._estimator)
