@@ -8,6 +8,8 @@ together with the states of the window.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from graphvio.arrays import Float
@@ -29,6 +31,7 @@ from graphvio.self_calibration.evidence import (
     Gaussian,
 )
 from graphvio.self_calibration.imu_model import GYRO_MATRIX, PARAMETERS, TIME_OFFSET
+from graphvio.self_calibration.knock import knock_covariance
 from graphvio.self_calibration.parameters import n_camera_parameters
 from graphvio.self_calibration.prior import file_prior
 
@@ -91,8 +94,8 @@ class WindowCalibration:
         return self.is_exact(self.factors)
 
     def is_exact(self, factors: Float) -> bool:
-        """Return whether some factors (G,) are those of an exact file."""
-        return bool((factors == EXACT).all())
+        """Return whether some factors (G,) are those of an exact file; after a knock, no file is exact."""
+        return self._prior.change is None and bool((factors == EXACT).all())
 
     @property
     def candidates(self) -> list[Float]:
@@ -177,6 +180,18 @@ class WindowCalibration:
         self._kept = Evidence.none(len(self._rows))
         self._files.clear()
 
+    def change(self, cameras: Iterable[int]) -> Float:
+        """Estimate some cameras' places again after a knock, and return the covariance (F, F) of what it changed.
+
+        All other parameters remain as well known as before.
+        """
+        whole = knock_covariance(self._rig, len(self._whole.covariance), cameras)
+        change: Float = whole[np.ix_(self._rows, self._rows)]
+        self._prior = self._prior.changed(change)
+        self._evidence, self._kept = (each.after_random_walk(change) for each in (self._evidence, self._kept))
+        self._files.clear()
+        return change
+
     def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Return whether a first window, adjusted with an exact file, shows that extrinsics or IMU are far off.
 
@@ -257,7 +272,12 @@ class WindowCalibration:
         in_force[self._rows], in_force[self._biases] = states.calibration, states.biases
         self._latest_ns = stamp_ns
         self.latest = CalibrationEstimate(
-            self._rig, Gaussian(mean, information), in_force, self.factors.copy(), self.twice_log_bayes_factor
+            self._rig,
+            Gaussian(mean, information),
+            in_force,
+            self.factors.copy(),
+            self.twice_log_bayes_factor,
+            is_changed=self._prior.change is not None,
         )
 
 

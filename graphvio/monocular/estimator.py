@@ -312,6 +312,10 @@ class MonocularEstimator:
             window.add_views(self._camera_tracks, self._is_stationary)
         self._is_keyframe = is_keyframe
         solution = self._solver.solve(window, stamp_ns, is_keyframe)
+        if solution.knocked:
+            names = ", ".join(self._rig.singles[j].name for j in sorted(solution.knocked))
+            why = f"views of cameras {names} have left their epipolar lines: the cameras' places are estimated again"
+            self._report(stamp_ns, EventKind.CALIBRATION_CHANGED, why)
         return StateUpdate(self._judge(stamp_ns, solution), outliers=solution.dropped)
 
     def _judge(self, stamp_ns: int, solution: Solution) -> Status:

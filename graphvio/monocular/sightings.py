@@ -7,7 +7,7 @@ once. The limit differs from track to track, so that only few tracks begin a new
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +51,10 @@ class Views(NamedTuple):
         width = int(max(self.camera.max(initial=0), cameras.max(initial=0))) + 1
         named = np.isin(self.landmark * width + self.camera, landmarks * width + cameras)
         return self._rows(~(self.is_adopted & named))
+
+    def without_cameras(self, cameras: Set[int]) -> Views:
+        """Return the views in the images of all but some cameras."""
+        return self._rows(~np.isin(self.camera, sorted(cameras)))
 
     def once(self, ranks: Int) -> Views:
         """Return at most one view of each landmark per camera: of several, that with the smallest rank (M,)."""

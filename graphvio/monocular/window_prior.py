@@ -64,6 +64,17 @@ class Prior(NamedTuple):
             turn[at : at + 3, at : at + 3] = new_T_odom[:3, :3]
         return Prior(self.at.turned(new_T_odom), turn @ self.information @ turn.T, turn @ self.gradient)
 
+    def after_change(self, covariance: Float) -> Prior:
+        """Return the prior after a change of the calibration with a covariance (F, F), zero for what did not change."""
+        changed = np.flatnonzero(np.diag(covariance))
+        at = len(self.gradient) - len(covariance) + changed
+        by_change = self.information[:, at]
+        of_change = np.linalg.inv(covariance[np.ix_(changed, changed)]) + by_change[at]
+        kept = by_change @ np.linalg.inv(of_change)
+        return self._replace(
+            information=self.information - kept @ by_change.T, gradient=self.gradient - kept @ self.gradient[at]
+        )
+
     def difference(self, states: States) -> Difference:
         """Return the difference of the current values of the same states from those at the linearisation."""
         then, off = self.at, states.since(self.at)

@@ -20,6 +20,7 @@ from graphvio.measurements.window_views import FirstWindow, WindowViews
 from graphvio.monocular.adjustment import Adjusted, Measurements, adjust, covariance_of, views_only
 from graphvio.monocular.calibration import WindowCalibration, time_offset_s
 from graphvio.monocular.held_landmarks import HeldLandmarks
+from graphvio.monocular.knock import CONFIRMED, OverlapKnockDetector
 from graphvio.monocular.marginalisation import first_window, with_landmarks, without_first
 from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.reprojection import Cameras
@@ -51,12 +52,14 @@ class Solution(NamedTuple):
         is_tracking: whether enough landmarks constrain the newest state.
         dropped: index of the camera -> identities of tracks that do not stand still.
         is_possible: whether real sensors may have the estimated calibration.
+        knocked: indices of the cameras whose places are estimated again from now on, after a knock.
     """
 
     imu_errors2: Float
     is_tracking: bool
     dropped: Mapping[int, Int]
     is_possible: bool
+    knocked: frozenset[int]
 
 
 class WindowSolver:
@@ -87,6 +90,7 @@ class WindowSolver:
         self._turns: list[Float] = []  # (6,) tangents of the epoch's changes of the frame, see `_recalibrated`
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
+        self._knocks = OverlapKnockDetector()
 
     # ------------------------------------------------------------------ what is known
 
@@ -141,8 +145,14 @@ class WindowSolver:
         if is_keyframe and held is not None:
             window.landmarks.put(held.ids, *held.moved_along(adjusted.states))
             adjusted, ids = self._adjusted(window, None, _KEYFRAME_STEPS)
+        knocked: frozenset[int] = frozenset()
         if is_keyframe and calibration.update_factors(adjusted, window.prior):
             adjusted = self._recalibrated(window, adjusted, ids)
+            self._knocks.forget()
+        elif is_keyframe and calibration.size:
+            knocked = self._knocks.update(window.views[-1], adjusted.states.cameras(self._cameras))
+            if knocked:
+                adjusted, ids = self._after_knock(window, knocked)
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
         is_tracking, dropped = self._leave_out_moving(window, adjusted, ids)
         self._solved = Solved(adjusted, ids, window.views[-1])
@@ -153,7 +163,7 @@ class WindowSolver:
                 calibration.note(stamp_ns, adjusted.states, self.covariance)
             self._finish_keyframe(window, adjusted)
             self._held = None
-        return Solution(adjusted.equations.imu_errors2, is_tracking, dropped, is_possible)
+        return Solution(adjusted.equations.imu_errors2, is_tracking, dropped, is_possible, knocked)
 
     def end(self, window: KeyframeWindow) -> None:
         """Declare all poses of the window final, and hand over the views of its landmarks."""
@@ -174,6 +184,7 @@ class WindowSolver:
     def forget(self) -> None:
         """Forget the last solution, with the covariance of its newest state."""
         self._solved, self._held, self.covariance, self._turns = None, None, NO_COVARIANCE, []
+        self._knocks.forget()
 
     # ------------------------------------------------------------------ parts of these steps
 
@@ -211,11 +222,30 @@ class WindowSolver:
         then, now = (
             each.states.poses[-1] @ each.states.cameras(self._cameras).body_T_cam[0] for each in (before, after)
         )
-        new_T_odom = then @ se3_inverse(now)
+        return self._moved(window, after, then @ se3_inverse(now))
+
+    def _moved(self, window: KeyframeWindow, adjusted: Adjusted, new_T_odom: Float) -> Adjusted:
+        """Express an adjusted window in another frame, given by ``new_T_odom`` (4, 4), and linearise it there."""
         self._turns.append(se3_log(new_T_odom))
         window.turn(new_T_odom)
         structure, places, _ = self._structure(window)
-        return adjust(after.measured._replace(structure=structure), window.states, places, window.prior, 0, file)
+        measured, file = adjusted.measured._replace(structure=structure), self.calibration.file()
+        return adjust(measured, window.states, places, window.prior, 0, file)
+
+    def _after_knock(self, window: KeyframeWindow, knocked: frozenset[int]) -> tuple[Adjusted, Int]:
+        """Adjust a window without the knocked cameras' views from before the knock, and with their places unknown.
+
+        The window is expressed in the frame in which the last keyframe before the knock is where it was.
+        """
+        self._knocks.forget()
+        last = max(len(window.views) - CONFIRMED - 1, 0)
+        then = window.states.poses[last]
+        before, since = window.views[: last + 1], window.views[last + 1 :]
+        window.views = [views.without_cameras(knocked) for views in before] + since
+        change = self.calibration.change(knocked)
+        window.prior = None if window.prior is None else window.prior.after_change(change)
+        adjusted, ids = self._adjusted(window, None, _RECALIBRATION_STEPS)
+        return self._moved(window, adjusted, then @ se3_inverse(adjusted.states.poses[last])), ids
 
     def _structure(self, window: KeyframeWindow) -> tuple[Structure, Float, Int]:
         """Return the window's landmarks, where they are (L, 3), and their identities (L,)."""
