@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from synthetic import random_transform
+from test_monocular import Flown, Tracks, aligned, fewer, fly, moving, overlapping_rig
 
 from graphvio.arrays import Float
-from graphvio.geometry import se3, se3_inverse, so3_exp
+from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.monocular.calibration import WindowCalibration
+from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.monocular.knock import OverlapKnockDetector
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import Views
@@ -51,9 +53,9 @@ def views(cameras: Cameras, rng: np.random.Generator, speed_px: float = 0.0, cou
         noise = NOISE_PX / CAMERAS.focal_px[camera] * rng.standard_normal((count, 2))
         rays.append(seen[:, :2] / seen[:, 2:] + noise)
     rays[1][:, 1] += speed_px / CAMERAS.focal_px[1]
-    camera, landmark = np.repeat([0, 1], count), np.tile(np.arange(count), 2)
+    seen_by, landmark = np.repeat([0, 1], count), np.tile(np.arange(count), 2)
     return Views(
-        camera, camera, landmark, landmark, np.concatenate(rays), np.zeros((2 * count, 4)), np.zeros(2 * count, bool)
+        seen_by, seen_by, landmark, landmark, np.concatenate(rays), np.zeros((2 * count, 4)), np.zeros(2 * count, bool)
     )
 
 
@@ -146,3 +148,38 @@ def test_prior_after_a_change_is_that_of_the_changed_variables() -> None:
     np.testing.assert_allclose(
         np.linalg.solve(after.information, after.gradient), np.linalg.solve(information, gradient), rtol=1e-5, atol=1e-8
     )
+
+
+def flown_with_a_knock(axis: tuple[float, float, float], degrees: float) -> tuple[Flown, float]:
+    """Fly two cameras of which one is turned after 5 s; return also the error of their relative rotation, degrees."""
+    rig = overlapping_rig()
+    other = rig.singles[1].left
+    knocked = replace(
+        other, body_T_cam=other.body_T_cam @ se3(so3_exp(np.deg2rad(degrees) * np.array(axis)), np.zeros(3))
+    )
+
+    def knock(t: float, _: MonocularEstimator, tracks: Tracks) -> None:
+        tracks._cameras[1] = knocked if t >= 5.0 else other
+
+    flown = fly(moving(), 10.0, fewer, rig=rig, on_keyframe=knock)
+    estimate = flown.estimator.calibration
+    assert estimate is not None
+    first, second = (single.left.body_T_cam for single in estimate.rig.singles)
+    error = se3_log(
+        se3_inverse(se3_inverse(first) @ second) @ se3_inverse(rig.singles[0].left.body_T_cam) @ knocked.body_T_cam
+    )
+    return flown, float(np.rad2deg(np.linalg.norm(error[:3])))
+
+
+def test_knock_is_followed() -> None:
+    flown, error_deg = flown_with_a_knock((0.48, 0.64, 0.6), 0.5)
+    assert [kind for kind, _ in flown.events].count("calibration_changed") == 1
+    assert error_deg < 0.02
+    error_m, scale = aligned(flown)
+    assert error_m < 0.015
+    assert scale == pytest.approx(1.0, abs=0.01)
+
+
+def test_flight_without_a_knock_shows_none() -> None:
+    flown, _ = flown_with_a_knock((1.0, 0.0, 0.0), 0.0)
+    assert [kind for kind, _ in flown.events] == ["scale_known"]
