@@ -14,6 +14,7 @@ from graphvio.backend.dead_reckoning import DeadReckoning
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.backend.states import InitialUncertainty, RigState, certain_origin
+from graphvio.backend.window import WindowError
 from graphvio.config import Config
 from graphvio.config.stages import SmootherConfig
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
@@ -127,6 +128,17 @@ def test_contradiction_ends_after_half_a_second_of_agreement(agreed_s: float, go
     assert set(walk.until(now_s + agreed_s)) == {()}
     (found,) = walk.until(now_s + agreed_s + 0.05, contradicts=True)
     assert found == ((0,) if goes_on else ())
+
+
+def test_state_is_not_at_fault_if_the_comparison_has_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise WindowError("no solution")
+
+    walk = Walk(0, (1.0, 1.1))
+    assert set(walk.until(AGREED_S)) == {()}
+    with monkeypatch.context() as patched:
+        patched.setattr(Smoother, "from_state", fail)
+        assert set(walk.until(AGREED_S + 0.5, contradicts=True)) == {()}
 
 
 def test_gap_of_the_imu_ends_the_comparison() -> None:

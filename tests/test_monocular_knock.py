@@ -102,6 +102,13 @@ def test_few_common_landmarks_show_no_knock() -> None:
     assert set(found([CAMERAS] * 10 + [turned(1, (1.0, 0.0, 0.0), 0.5)] * 10, count=29)) == {frozenset()}
 
 
+def test_rolling_shutters_show_no_knock() -> None:
+    detector, rng = OverlapKnockDetector(), np.random.default_rng(0)
+    for cameras in [CAMERAS] * 10 + [turned(1, (1.0, 0.0, 0.0), 0.5)] * 4:
+        seen = views(cameras, rng)
+        assert detector.update(seen._replace(readout=seen.readout + 0.01), CAMERAS) == frozenset()
+
+
 def test_only_places_of_knocked_cameras_become_uncertain() -> None:
     calibration = WindowCalibration(RIG)
     assert calibration.file() is None

@@ -7,6 +7,7 @@ them over that time, since it follows the motion that covers all hypotheses.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.smoother import Smoother
+from graphvio.backend.window import SOLVER_ERRORS
 from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
@@ -97,10 +99,11 @@ class DeadReckoning:
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> None:
         """Extend the prediction by the IMU to a frameset; without an interval, it ends."""
         self._newest = stamp_ns, interval
-        if interval is None:
-            self._comparison = None
-        elif self._comparison is not None:
-            self._comparison.imu.extend(stamp_ns, interval)
+        comparison, self._comparison = self._comparison, None
+        if interval is not None and comparison is not None:
+            with suppress(*SOLVER_ERRORS):
+                comparison.imu.extend(stamp_ns, interval)
+                self._comparison = comparison
 
     def pairs_to_follow(self, visual: VisualResult, smoother: Smoother) -> Pairs:
         """Return the pairs whose motions are to be followed, or none where that is not decided.
@@ -121,12 +124,15 @@ class DeadReckoning:
                 self._comparison.add_agreed(motion)
             return ()
         self._contradicting_ns = motion.stamp_ns
-        if not visual.is_calibration_trusted:
-            self._comparison = None
-        elif self._comparison is None or motion.stamp_ns - self._comparison.since_ns > _MAX_DURATION_NS:
-            self._comparison = self._begin(smoother)
-        if self._comparison is not None:
-            self._followed = self._chosen([each.with_any_velocity() for each in visual.alternatives], self._comparison)
+        comparison, self._comparison = self._comparison, None
+        motions = [each.with_any_velocity() for each in visual.alternatives]
+        if visual.is_calibration_trusted:
+            with suppress(*SOLVER_ERRORS):  # nothing is decided then; the state is not at fault
+                if comparison is None or motion.stamp_ns - comparison.since_ns > _MAX_DURATION_NS:
+                    comparison = self._begin(smoother)
+                if comparison is not None:
+                    self._followed = self._chosen(motions, comparison)
+                self._comparison = comparison
         return self._followed
 
     def _begin(self, smoother: Smoother) -> _Comparison | None:

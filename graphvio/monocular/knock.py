@@ -42,8 +42,11 @@ class OverlapKnockDetector:
 
         Returns:
             Indices of the cameras whose common landmarks left their epipolar lines three keyframes ago: one of each two
-            has been turned, and these do not show which one.
+            has been turned, and these do not show which one. None with rolling shutters, whose lines are exposed at
+            different places.
         """
+        if views.readout.any():
+            return frozenset()
         knocked: set[int] = set()
         for pair in combinations(np.unique(views.camera).tolist(), 2):
             offset_px = _offset_px(views, cameras, *pair)
