@@ -35,9 +35,17 @@ class Walk:
         seed: Seed of all noise.
         scales: Lengths of the motions that the two pairs measure, as a share of the true ones.
         per_reference: Number of framesets whose motions have the same reference.
+        sigmas: Noise of motions by vision, rad and m.
     """
 
-    def __init__(self, seed: int, scales: tuple[float, float] = (1.0, 1.0), per_reference: int = 1) -> None:
+    def __init__(
+        self,
+        seed: int,
+        scales: tuple[float, float] = (1.0, 1.0),
+        per_reference: int = 1,
+        sigmas: tuple[float, float] = SIGMAS,
+    ) -> None:
+        self._sigmas = sigmas
         self._rng, self._scales, self._per_reference = np.random.default_rng(seed), scales, per_reference
         biases = 0.003 * self._rng.standard_normal(3), 0.05 * self._rng.standard_normal(3)
         self._samples = filled_buffer(IMU, 5.0, self._rng, *biases)
@@ -83,7 +91,7 @@ class Walk:
         return VisualResult(motion, Quality.WEAK, "two motions", {}, alternatives=tuple(motions))
 
     def _measured(self, scale: float, pairs: tuple[int, ...]) -> RelativeMotion:
-        motion = measured_motion(self._reference_ns, self.smoother.latest_ns, self._rng, *SIGMAS)
+        motion = measured_motion(self._reference_ns, self.smoother.latest_ns, self._rng, *self._sigmas)
         measured = motion.reference_T_current.copy()
         measured[:3, 3] *= scale
         return RelativeMotion(
@@ -141,6 +149,25 @@ def test_state_is_not_at_fault_if_the_comparison_has_no_solution(monkeypatch: py
         assert set(walk.until(AGREED_S + 0.5, contradicts=True)) == {()}
 
 
+def test_comparison_goes_on_while_the_pairs_agree_for_a_moment() -> None:
+    """Each motion begins at the frameset before, so that one that is left out would break the chain."""
+    walk = Walk(0, (1.0, 1.02))
+    assert set(walk.until(AGREED_S)) == {()}
+    for k in range(9):
+        list(walk.until(AGREED_S + 0.05 * (k + 1), contradicts=k % 2 == 0))
+    comparison = walk.dead_reckoning._comparison
+    assert comparison is not None
+    assert all(walk.smoother.latest_ns in chain for chain in comparison.chains.values())
+
+
+def test_pairs_are_found_although_the_contradiction_was_small_for_long() -> None:
+    """The IMU alone is too inaccurate after some seconds, so that the comparison begins again from time to time."""
+    walk = Walk(0, (1.0, 1.004))
+    assert set(followed(walk, 1.75)) == {()}
+    walk._scales = (1.0, 1.08)
+    assert list(walk.until(AGREED_S + 2.75, contradicts=True))[-1] == (0,)
+
+
 def test_gap_of_the_imu_ends_the_comparison() -> None:
     walk = Walk(0, (1.0, 1.1))
     assert set(walk.until(AGREED_S)) == {()}
@@ -190,6 +217,27 @@ def moved_m(*, is_trusted: bool) -> float:
 def test_state_follows_the_pairs_that_the_imu_agrees_with() -> None:
     assert moved_m(is_trusted=True) < 0.005
     assert moved_m(is_trusted=False) > 0.01
+
+
+@pytest.mark.parametrize("sigmas", [SIGMAS, (5e-3, 2e-3)])
+def test_prediction_from_a_state_is_as_uncertain_as_that_of_the_whole_window(sigmas: tuple[float, float]) -> None:
+    """Attitude, velocity and gravity have common errors in nav, which do not matter for the motion since then."""
+    walk = Walk(0, sigmas=sigmas)
+    list(walk.until(AGREED_S))
+    whole, since_ns = walk.smoother, walk.smoother.latest_ns
+    alone = whole.from_state(since_ns)
+    for _ in range(10):
+        walk.predict()
+        alone.extend(whole.latest_ns, walk._samples.interval(alone.latest_ns, whole.latest_ns))
+    np.testing.assert_allclose(
+        np.linalg.inv(alone.pose(since_ns)) @ alone.pose(alone.latest_ns),
+        np.linalg.inv(whole.pose(since_ns)) @ whole.pose(whole.latest_ns),
+        atol=1e-9,
+    )
+    expected = whole.covariance_since(since_ns)
+    scale = np.sqrt(np.diag(expected))
+    difference = (alone.covariance_since(since_ns) - expected) / np.outer(scale, scale)
+    np.testing.assert_allclose(difference, 0.0, atol=0.05)
 
 
 def test_prediction_from_a_state_is_consistent() -> None:

@@ -83,6 +83,7 @@ def test_turned_camera_is_found_at_the_third_keyframe(camera: int, axis: tuple[f
         [CAMERAS] * 40,
         [turned(1, (1.0, 0.0, 0.0), 0.5)] * 40,  # as wrong from the beginning: the file's error
         [CAMERAS] * 10 + [turned(1, (0.0, 1.0, 0.0), 0.1)] * 10,  # along the epipolar lines
+        [CAMERAS] * 10 + [turned(1, (1.0, 0.0, 0.0), 0.02)] * 10,  # by less than a quarter of a pixel
         [CAMERAS] * 10 + [turned(1, (1.0, 0.0, 0.0), 0.5)] * 2 + [CAMERAS] * 10,  # for two keyframes
         [CAMERAS] * 6 + [turned(1, (1.0, 0.0, 0.0), 0.5)] * 7,  # too little was known before
     ],
@@ -124,6 +125,18 @@ def test_only_places_of_knocked_cameras_become_uncertain() -> None:
     assert (sigmas[places[3:]] > 0.004).all()
     assert (sigmas[others] < 0.01 * stated[others]).all()
     np.testing.assert_array_equal(np.flatnonzero(np.diag(change)), places)
+
+
+def test_knock_after_a_correction_of_the_file_is_in_the_prior() -> None:
+    calibration = WindowCalibration(RIG)
+    calibration.begin(np.ones(2))
+    before = calibration.file()
+    change = calibration.change({1})
+    after = calibration.file()
+    assert before is not None
+    assert after is not None
+    added = np.linalg.inv(after.information) - np.linalg.inv(before.information)
+    np.testing.assert_allclose(added, change, rtol=1e-3, atol=1e-9)
 
 
 def test_evidence_about_knocked_cameras_is_forgotten() -> None:

@@ -37,7 +37,6 @@ from graphvio.backend.states import (
     InitialUncertainty,
     RigState,
     StateCovariance,
-    certain_origin,
     level_gravity,
     tilt_covariance,
 )
@@ -50,6 +49,7 @@ from graphvio.measurements.motion import ByVelocities, RelativeMotion
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
+_DEFINED_SIGMA = 1e-5  # of a pose that defines nav, radians and metres
 _RESET_SIGMA_M = 1e-3  # the position's own standard deviation after a reset
 _POSE_AND_GRAVITY = np.r_[0:6, 15:18]
 _MAX_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
@@ -104,9 +104,8 @@ class Smoother:
         nav_R_body = state.nav_T_body[:3, :3]
         for rows, vector in ((slice(0, 3), state.velocity_nav), (slice(9, 12), state.gravity_nav)):
             of_inertial[rows, :3] = nav_R_body @ skew(nav_R_body.T @ vector)
-        uncertainty = InitialUncertainty(
-            certain_origin(), 0.0, 0.0, inertial=np.asarray(of_inertial @ joint @ of_inertial.T)
-        )
+        pose = np.eye(6) * _DEFINED_SIGMA**2
+        uncertainty = InitialUncertainty(pose, 0.0, 0.0, inertial=np.asarray(of_inertial @ joint @ of_inertial.T))
         alone = Smoother(self._config, self._imu)
         alone.initialise(stamp_ns, state, uncertainty)
         return alone
