@@ -138,6 +138,36 @@ def test_contradiction_ends_after_half_a_second_of_agreement(agreed_s: float, go
     assert found == ((0,) if goes_on else ())
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_comparison_that_begins_during_a_contradiction_finds_the_pairs(seed: int) -> None:
+    """Motions are from an older keyframe then, until which the pairs had contradicted each other."""
+    walk = Walk(seed, (1.0, 1.1), 7)
+    assert set(walk.until(AGREED_S)) == {()}
+    assert set(walk.until(AGREED_S + 0.5, contradicts=True, is_trusted=False)) == {()}
+    assert (1,) not in (found := list(walk.until(AGREED_S + 2.5, contradicts=True)))
+    assert found[-1] == (0,)
+
+
+def test_contradiction_after_a_gap_is_another_one() -> None:
+    walk = Walk(0, (1.0, 1.1))
+    assert followed(walk)[-1] == (0,)
+    for _ in range(12):  # framesets without a motion
+        walk.predict()
+        walk.smoother.update(frozenset())
+    walk._reference_ns, walk._scales = walk.smoother.latest_ns, (1.01, 1.0)
+    (found,) = walk.until(AGREED_S + 1.65, contradicts=True)
+    assert found == ()
+
+
+def test_prediction_by_the_imu_ends_after_a_while() -> None:
+    walk = Walk(0, (1.0, 1.1))
+    assert followed(walk)[-1] == (0,)
+    assert walk.dead_reckoning._comparison is not None
+    for _ in range(30):
+        walk.predict()
+    assert walk.dead_reckoning._comparison is None
+
+
 def test_state_is_not_at_fault_if_the_comparison_has_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise WindowError("no solution")

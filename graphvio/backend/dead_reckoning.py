@@ -7,6 +7,7 @@ them over that time, since it follows the motion that covers all hypotheses.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,7 +30,7 @@ Pairs = tuple[int, ...]
 """Indices of the pairs and single cameras of a motion hypothesis."""
 
 
-class _Chained(NamedTuple):
+class _ChainedPose(NamedTuple):
     """A pose relative to the first one of a chain of motions.
 
     Attributes:
@@ -40,23 +41,23 @@ class _Chained(NamedTuple):
     first_T_last: Float
     covariance: Float
 
-    def then(self, motion: RelativeMotion) -> _Chained:
+    def then(self, motion: RelativeMotion) -> _ChainedPose:
         """Return the pose after one more motion."""
         adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
-        return _Chained(
+        return _ChainedPose(
             self.first_T_last @ motion.reference_T_current, adjoint @ self.covariance @ adjoint.T + motion.covariance
         )
 
-    def before(self, motion: RelativeMotion) -> _Chained:
+    def before(self, motion: RelativeMotion) -> _ChainedPose:
         """Return the pose at the reference of a motion that ends in this pose."""
         adjoint = se3_adjoint(motion.reference_T_current)
-        return _Chained(
+        return _ChainedPose(
             self.first_T_last @ se3_inverse(motion.reference_T_current),
             adjoint @ (self.covariance + motion.covariance) @ adjoint.T,
         )
 
 
-_Chain = dict[int, _Chained]
+_Chain = dict[int, _ChainedPose]
 """Stamp -> pose, of all framesets that later motions may be measured from."""
 
 
@@ -66,7 +67,7 @@ class _Comparison:
 
     since_ns: int
     imu: Smoother
-    agreed: _Chain  # as far as all pairs agree
+    agreed: _Chain  # by motions that all pairs agree on
     chains: dict[Pairs, _Chain]
 
     def add_agreed(self, motion: RelativeMotion) -> None:
@@ -74,16 +75,16 @@ class _Comparison:
         for chain in (self.agreed, *self.chains.values()):
             _extend(chain, motion)
 
-    def gate(self, motion: RelativeMotion) -> GateResult | None:
+    def add_and_test(self, motion: RelativeMotion) -> GateResult | None:
         """Add the motion of a hypothesis, and test all its motions since the beginning; None if they are no chain."""
         chained = _extend(self.chains.setdefault(motion.pairs, dict(self.agreed)), motion)
         if chained is None:
             return None
         # Without the covariance of the calibration: if errors of the calibration mattered, none would agree.
-        whole = RelativeMotion(
+        since_beginning = RelativeMotion(
             self.since_ns, motion.stamp_ns, chained.first_T_last, chained.covariance, _CERTAIN, motion.inliers
         )
-        return self.imu.gate(whole)
+        return self.imu.gate(since_beginning)
 
 
 class DeadReckoning:
@@ -91,16 +92,20 @@ class DeadReckoning:
 
     def __init__(self) -> None:
         self._newest: tuple[int, ImuInterval | None] = (0, None)
-        self._agreed: RelativeMotion | None = None  # the newest motion that all pairs agree on
+        self._motions: dict[Pairs, RelativeMotion] = {}  # of the newest frameset; of () where all pairs agree
         self._contradicting_ns = 0  # stamp of the newest frameset with a contradiction
         self._comparison: _Comparison | None = None
         self._followed: Pairs = ()
 
+    def restart(self) -> None:
+        """End the comparison: the state that it began with was wrong."""
+        self._comparison = None
+
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> None:
-        """Extend the prediction by the IMU to a frameset; without an interval, it ends."""
+        """Extend the prediction by the IMU to a frameset; it ends after 1.5 s, and without an interval."""
         self._newest = stamp_ns, interval
         comparison, self._comparison = self._comparison, None
-        if interval is not None and comparison is not None:
+        if interval is not None and comparison is not None and stamp_ns - comparison.since_ns <= _MAX_DURATION_NS:
             with suppress(*SOLVER_ERRORS):
                 comparison.imu.extend(stamp_ns, interval)
                 self._comparison = comparison
@@ -108,54 +113,62 @@ class DeadReckoning:
     def pairs_to_follow(self, visual: VisualResult, smoother: Smoother) -> Pairs:
         """Return the pairs whose motions are to be followed, or none where that is not decided.
 
-        While the calibration is not trusted, nothing is decided: the motions of all pairs may be wrong.
+        While the calibration is not trusted, nothing new is decided: the motions of all pairs may be wrong.
 
         Args:
             visual: Result of the visual front-end for the predicted frameset, with a motion.
             smoother: Smoother of the state estimator, extended to the frameset.
         """
         assert visual.motion is not None
-        motion = visual.motion.with_any_velocity()
+        motion, before = visual.motion.with_any_velocity(), self._motions
+        if motion.stamp_ns - self._contradicting_ns > _MIN_AGREEMENT_NS:
+            self._comparison, self._followed = None, ()
         if not visual.alternatives:
-            self._agreed = motion
-            if motion.stamp_ns - self._contradicting_ns > _MIN_AGREEMENT_NS:
-                self._comparison, self._followed = None, ()
-            elif self._comparison is not None:
+            self._motions = {(): motion}
+            if self._comparison is not None:
                 self._comparison.add_agreed(motion)
             return ()
-        self._contradicting_ns = motion.stamp_ns
-        comparison, self._comparison = self._comparison, None
         motions = [each.with_any_velocity() for each in visual.alternatives]
+        self._contradicting_ns, self._motions = motion.stamp_ns, {each.pairs: each for each in motions}
+        comparison, self._comparison = self._comparison, None
         if visual.is_calibration_trusted:
             with suppress(*SOLVER_ERRORS):  # nothing is decided then; the state is not at fault
-                if comparison is None or motion.stamp_ns - comparison.since_ns > _MAX_DURATION_NS:
-                    comparison = self._begin(smoother)
+                if comparison is None:
+                    comparison = self._begin(smoother, before)
                 if comparison is not None:
                     self._followed = self._chosen(motions, comparison)
                 self._comparison = comparison
         return self._followed
 
-    def _begin(self, smoother: Smoother) -> _Comparison | None:
-        """Begin a comparison at the state before the newest one; None if there is none, or without the IMU."""
+    def _begin(self, smoother: Smoother, before: Mapping[Pairs, RelativeMotion]) -> _Comparison | None:
+        """Begin a comparison at the state before the newest one; None if there is none, or without the IMU.
+
+        Args:
+            smoother: Smoother of the state estimator, extended to the newest frameset.
+            before: Motions until the state before: of each hypothesis, or of () where all pairs agreed.
+        """
         stamp_ns, interval = self._newest
         since_ns = smoother.previous_ns
         if interval is None or since_ns is None or stamp_ns != smoother.latest_ns:
             return None
         imu = smoother.from_state(since_ns)
         imu.extend(stamp_ns, interval)
-        first = _Chained(np.eye(4), _CERTAIN)
-        chain = {since_ns: first}
-        if self._agreed is not None and self._agreed.stamp_ns == since_ns:
-            chain[self._agreed.reference_stamp_ns] = first.before(self._agreed)
-        return _Comparison(since_ns, imu, chain, {})
+        first = _ChainedPose(np.eye(4), _CERTAIN)
+        chains: dict[Pairs, _Chain] = {(): {since_ns: first}}
+        for pairs, motion in before.items():
+            if motion.stamp_ns == since_ns:
+                chains[pairs] = {since_ns: first, motion.reference_stamp_ns: first.before(motion)}
+        return _Comparison(since_ns, imu, chains.pop(()), chains)
 
     def _chosen(self, motions: list[RelativeMotion], comparison: _Comparison) -> Pairs:
         """Return the pairs of the only hypothesis that the IMU agrees with, or else those followed until now.
 
         Pairs that the IMU contradicts are no longer followed.
         """
-        tested = [(result, motion.pairs) for motion in motions if (result := comparison.gate(motion)) is not None]
-        if len(tested) == len(motions):
+        tested = [
+            (result, motion.pairs) for motion in motions if (result := comparison.add_and_test(motion)) is not None
+        ]
+        if len(tested) == len(motions) > 1:
             (likely, pairs), (unlikely, _), *_ = sorted(tested, key=lambda each: each[0].statistic)
             if likely.accepted and likely.is_clear and not unlikely.accepted:
                 return pairs
@@ -163,7 +176,7 @@ class DeadReckoning:
         return () if is_refuted else self._followed
 
 
-def _extend(chain: _Chain, motion: RelativeMotion) -> _Chained | None:
+def _extend(chain: _Chain, motion: RelativeMotion) -> _ChainedPose | None:
     """Add a motion to a chain, and return the pose after it; None if the chain lacks the motion's reference."""
     reference = chain.get(motion.reference_stamp_ns)
     if reference is None:

@@ -235,6 +235,7 @@ class SmootherEstimator:
         followed wrong samples; when motions are only refused for too long, roll and pitch do not.
         """
         self._refused.distrust_prediction()
+        self._dead_reckoning.restart()
 
     def use_imu_again(self, motion: RelativeMotion, match: ImuMatch) -> None:
         """Use the IMU again after it was left out: keep the newest pose, and reset velocity, biases and gravity.
@@ -280,6 +281,7 @@ class SmootherEstimator:
             self._carry_motions(initial.state.nav_T_body)
             self._final += smoother.all_poses()[:-1]
             smoother.initialise(initial.stamp_ns, initial.state, initial.uncertainty)
+            self._dead_reckoning.restart()
             self._tracked_ns, self._rebuilt_sigma_m = initial.stamp_ns, self._sigma_m
             self.covariance = smoother.state_covariance()
         except SOLVER_ERRORS as error:

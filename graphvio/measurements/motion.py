@@ -212,7 +212,7 @@ class VisualResult:
         pairs: Pair index -> report of the pair.
         alternatives: Motion hypotheses with their own covariances, where pairs contradict each other.
         is_calibration_trusted: Whether contradictions are attributed to the scene or to a knock, and not to the rig
-            file.
+            file; always where the calibration is not estimated.
         partial_motion: Where too few points are in view for a motion, the motion that an IMU predicts, corrected by
             these points; its covariance is that of the correction, and large in directions that they do not determine.
         own: At the end of a keyframe, pair index -> motion of body by this pair alone, with the rig's extrinsics.

@@ -94,8 +94,8 @@ class WindowCalibration:
         return self.is_exact(self.factors)
 
     def is_exact(self, factors: Float) -> bool:
-        """Return whether some factors (G,) are those of an exact file; after a knock, no file is exact."""
-        return self._prior.change is None and bool((factors == EXACT).all())
+        """Return whether the calibration is pinned to the file: its factors (G,) are exact, and nothing was knocked."""
+        return self._prior.change is None and _are_exact(factors)
 
     @property
     def candidates(self) -> list[Float]:
@@ -142,7 +142,7 @@ class WindowCalibration:
 
     def _is_within(self, max_sigmas: float, difference: Float) -> bool:
         """Return whether a difference (F,) is within some of the rig file's standard deviations times `MAX_FACTOR`."""
-        sigmas = MAX_FACTOR * np.sqrt(np.diag(self._prior.covariance))
+        sigmas = np.sqrt(np.diag(self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))))
         return bool((np.abs(difference) <= max_sigmas * sigmas).all())
 
     def walk(self, seconds: float) -> Float:
@@ -180,7 +180,7 @@ class WindowCalibration:
         self._kept = Evidence.none(len(self._rows))
         self._files.clear()
 
-    def change(self, cameras: Iterable[int]) -> Float:
+    def release_places(self, cameras: Iterable[int]) -> Float:
         """Estimate some cameras' places again after a knock, and return the covariance (F, F) of what it changed.
 
         All other parameters remain as well known as before.
@@ -191,6 +191,18 @@ class WindowCalibration:
         self._evidence, self._kept = (each.after_random_walk(change) for each in (self._evidence, self._kept))
         self._files.clear()
         return change
+
+    @property
+    def covariance_so_far(self) -> Float:
+        """Covariance (F, F) of all parameters, by the evidence so far and a file as wrong as stated or more."""
+        known = self._evidence.given(self._prior, np.maximum(self.factors, _MIN_FACTOR))
+        return np.asarray(np.linalg.inv(known.information))
+
+    def after_restart(self) -> WindowCalibration:
+        """Return the calibration before any evidence, with the same knocks since the rig file was made."""
+        begun = WindowCalibration(self._rig, self.size > 0)
+        begun._prior = self._prior
+        return begun
 
     def is_contradicted(self, adjusted: Adjusted, prior: Prior | None) -> bool:
         """Return whether a first window, adjusted with an exact file, shows that extrinsics or IMU are far off.
@@ -243,11 +255,12 @@ class WindowCalibration:
         found, self.twice_log_bayes_factor = self._evidence.file_factors(
             self._prior, MIN_TWICE_LOG_BAYES_FACTORS, likelihood
         )
-        if not (self.is_file_exact and self.is_exact(found)):
+        was_exact = _are_exact(before)
+        if not (was_exact and _are_exact(found)):
             # Errors that all tracks of a camera share look like those of its lens: this factor does not grow.
             of_lenses = np.minimum(found[:1], np.maximum(self._first_factors[:1], _MIN_FACTOR))
             likeliest = np.maximum(np.concatenate([of_lenses, found[1:]]), _MIN_FACTOR)
-            if self.is_file_exact or likelihood(likeliest) - likelihood(before) > _MIN_TWICE_LOG_RATIO:
+            if was_exact or likelihood(likeliest) - likelihood(before) > _MIN_TWICE_LOG_RATIO:
                 self.factors = likeliest
         return not np.array_equal(self.factors, before)
 
@@ -279,6 +292,10 @@ class WindowCalibration:
             self.twice_log_bayes_factor,
             is_changed=self._prior.change is not None,
         )
+
+
+def _are_exact(factors: Float) -> bool:
+    return bool((factors == EXACT).all())
 
 
 def time_offset_s(difference: Float) -> float:

@@ -370,7 +370,7 @@ class MonocularEstimator:
     def restart_imu(self, stamp_ns: int) -> None:
         """End the epoch, and forget samples and calibration: until this frameset the IMU's clock was wrong."""
         self._lose(stamp_ns, "the IMU's clock is corrected")
-        self._calibration = WindowCalibration(self._rig, self._config.estimates_calibration)
+        self._calibration = self._calibration.after_restart()
         self._samples, self._shift_ns = self._new_samples(), 0
         self._solver.calibration, self._solver.samples = self._calibration, self._samples
         self._are_trusted = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -10,11 +11,13 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_inverse, skew
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import Views
+from graphvio.self_calibration.parameters import PLACE, SINGLE
 
 _MIN_COMMON = 30  # landmarks that two cameras see at a keyframe
-_MIN_CHANGE_PX = 0.25  # median, as for pairs
+_MIN_CHANGE_PX = 0.25  # median; see `_MAX_OFFSET_PX` in `graphvio.self_calibration.knock`
+_MIN_SIGMAS = 4.0  # of the offset, by the covariance of the calibration
 CONFIRMED = 3  # keyframes since a knock, one after the other
-_KNOWN = 8  # keyframes before it
+_BEFORE = 8  # keyframes before it
 _MAX_RELATIVE_CHANGE = 0.2  # between keyframes since the knock: a turned camera's offset stays
 _MAX_RELATIVE_SPREAD = 0.5  # of the offsets before the knock, in units of the change
 
@@ -24,21 +27,26 @@ class OverlapKnockDetector:
 
     What counts is a change from one keyframe to the next, after which the offset stays. A constant offset is an error
     of the rig file, which the window estimates.
+
+    Args:
+        cameras: cameras of the rig file.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cameras: Cameras) -> None:
+        self._cameras = cameras
         self._offsets_px: dict[tuple[int, int], list[float]] = {}
 
     def forget(self) -> None:
         """Forget all offsets: later ones are measured by other cameras."""
         self._offsets_px = {}
 
-    def update(self, views: Views, cameras: Cameras) -> frozenset[int]:
+    def update(self, views: Views, difference: Float, covariance: Callable[[], Float]) -> frozenset[int]:
         """Add a keyframe, and return the cameras that may have been knocked.
 
         Args:
             views: views from the keyframe.
-            cameras: calibration that is in force.
+            difference: (C * SINGLE,) difference of the cameras in force from those of the rig file.
+            covariance: returns the covariance of the calibration, the cameras' parameters first.
 
         Returns:
             Indices of the cameras whose common landmarks left their epipolar lines three keyframes ago: one of each two
@@ -47,21 +55,39 @@ class OverlapKnockDetector:
         """
         if views.readout.any():
             return frozenset()
+        cameras = self._cameras.moved(difference)
         knocked: set[int] = set()
         for pair in combinations(np.unique(views.camera).tolist(), 2):
             offset_px = _offset_px(views, cameras, *pair)
             if offset_px is None:
                 continue
-            offsets = [*self._offsets_px.get(pair, []), offset_px][-_KNOWN - CONFIRMED :]
+            offsets = [*self._offsets_px.get(pair, []), offset_px][-_BEFORE - CONFIRMED :]
             self._offsets_px[pair] = offsets
             if _has_changed(np.array(offsets)):
-                knocked.update(pair)
+                # If a place is slightly wrong, near landmarks have another offset than far ones.
+                sigma_px = self._offset_sigma_px(views, difference, covariance(), pair)
+                if abs(offset_px - np.median(offsets[:-CONFIRMED])) > _MIN_SIGMAS * sigma_px:
+                    knocked.update(pair)
         return frozenset(knocked)
+
+    def _offset_sigma_px(self, views: Views, difference: Float, covariance: Float, pair: tuple[int, int]) -> float:
+        """Return the standard deviation of an offset by the covariance of both cameras' places."""
+        places = np.concatenate([SINGLE * camera + np.arange(PLACE, SINGLE) for camera in pair])
+        of_places = covariance[np.ix_(places, places)]
+        gradient = np.zeros(len(places))
+        for k, sigma in enumerate(np.sqrt(np.diag(of_places))):
+            for sign in (1.0, -1.0):
+                moved = difference.copy()
+                moved[places[k]] += sign * sigma
+                offset_px = _offset_px(views, self._cameras.moved(moved), *pair)
+                assert offset_px is not None, "the views are the same as before"
+                gradient[k] += sign * offset_px / (2.0 * sigma)
+        return float(np.sqrt(gradient @ of_places @ gradient))
 
 
 def _has_changed(offsets_px: Float) -> bool:
     """Return whether offsets (N,) changed before the last three, and stay as they are since then."""
-    if len(offsets_px) < _KNOWN + CONFIRMED:
+    if len(offsets_px) < _BEFORE + CONFIRMED:
         return False
     before, since = offsets_px[:-CONFIRMED], offsets_px[-CONFIRMED:]
     changes = since - np.median(before)

@@ -87,10 +87,10 @@ class WindowSolver:
         self._sigma_px = FIRST_MONOCULAR_SIGMA_PX
         self._solved: Solved | None = None
         self._held: HeldLandmarks | None = None
-        self._turns: list[Float] = []  # (6,) tangents of the epoch's changes of the frame, see `_recalibrated`
+        self._turns: list[Float] = []  # (6,) tangents of the epoch's changes of the frame, see `_moved`
         self._final: list[tuple[int, Float]] = []
         self._on_views: Callable[[WindowViews | FirstWindow], None] | None = None
-        self._knocks = OverlapKnockDetector()
+        self._knocks = OverlapKnockDetector(cameras)
 
     # ------------------------------------------------------------------ what is known
 
@@ -115,7 +115,7 @@ class WindowSolver:
         """Return the covariance (6, 6) of a pose (4, 4) by the steps that were taken out of the trajectory.
 
         Relative to the first pose, the trajectory is off by as much as its frame was turned where the rig file had
-        proved wrong; the covariance of the state does not include this. The tangent is in body.
+        proved wrong, or after a knock; the covariance of the state does not include this. The tangent is in body.
         """
         body_by_odom = se3_adjoint(se3_inverse(odom_T_body))
         turns = body_by_odom @ np.array(self._turns).reshape(-1, 6).T
@@ -150,7 +150,8 @@ class WindowSolver:
             adjusted = self._recalibrated(window, adjusted, ids)
             self._knocks.forget()
         elif is_keyframe and calibration.size:
-            knocked = self._knocks.update(window.views[-1], adjusted.states.cameras(self._cameras))
+            difference = adjusted.states.calibration[: adjusted.states.n_camera_parameters]
+            knocked = self._knocks.update(window.views[-1], difference, lambda: calibration.covariance_so_far)
             if knocked:
                 adjusted, ids = self._after_knock(window, knocked)
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
@@ -238,11 +239,11 @@ class WindowSolver:
         The window is expressed in the frame in which the last keyframe before the knock is where it was.
         """
         self._knocks.forget()
-        last = max(len(window.views) - CONFIRMED - 1, 0)
+        last = len(window.views) - CONFIRMED - 1
         then = window.states.poses[last]
         before, since = window.views[: last + 1], window.views[last + 1 :]
         window.views = [views.without_cameras(knocked) for views in before] + since
-        change = self.calibration.change(knocked)
+        change = self.calibration.release_places(knocked)
         window.prior = None if window.prior is None else window.prior.after_change(change)
         adjusted, ids = self._adjusted(window, None, _RECALIBRATION_STEPS)
         return self._moved(window, adjusted, then @ se3_inverse(adjusted.states.poses[last])), ids
