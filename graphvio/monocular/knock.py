@@ -8,9 +8,10 @@ from itertools import combinations
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.geometry import se3_inverse, skew
+from graphvio.geometry import se3_inverse
 from graphvio.monocular.reprojection import Cameras
 from graphvio.monocular.sightings import Views
+from graphvio.self_calibration.knock import epipolar_distances
 from graphvio.self_calibration.parameters import PLACE, SINGLE
 
 _MIN_COMMON = 30  # landmarks that two cameras see at a keyframe
@@ -103,9 +104,6 @@ def _offset_px(views: Views, cameras: Cameras, one: int, other: int) -> float | 
     _, first, second = np.intersect1d(views.landmark[of_one], views.landmark[of_other], return_indices=True)
     if len(first) < _MIN_COMMON:
         return None
-    common = of_one[first], of_other[second]
-    rays = [np.column_stack([views.rays[rows], np.ones(len(rows))]) for rows in common]
     other_T_one = se3_inverse(cameras.body_T_cam[other]) @ cameras.body_T_cam[one]
-    lines = rays[0] @ (skew(other_T_one[:3, 3]) @ other_T_one[:3, :3]).T
-    distances = np.sum(lines * rays[1], axis=1) / np.hypot(lines[:, 0], lines[:, 1])
+    distances = epipolar_distances(views.rays[of_one[first]], views.rays[of_other[second]], other_T_one)
     return float(np.median(distances) * cameras.focal_px[other])

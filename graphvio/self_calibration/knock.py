@@ -82,17 +82,28 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
     return None if view.has_right.sum() < _MIN_MATCHES else _offset_px(view, calibration, pair)
 
 
+def epipolar_distances(rays_one: Float, rays_other: Float, other_T_one: Float) -> Float:
+    """Return the signed distances (N,) of points in another image from the epipolar lines of the same points in one.
+
+    Args:
+        rays_one: (N, 2) normalised coordinates in one camera.
+        rays_other: (N, 2) normalised coordinates in the other one.
+        other_T_one: (4, 4) pose of the one in the other.
+    """
+    one, other = (np.column_stack([rays, np.ones(len(rays))]) for rays in (rays_one, rays_other))
+    lines = one @ (skew(other_T_one[:3, 3]) @ other_T_one[:3, :3]).T
+    return np.asarray(np.sum(lines * other, axis=1) / np.hypot(lines[:, 0], lines[:, 1]))
+
+
 def _offset_px(view: View, calibration: RigCalibration, pair: int) -> float:
-    matched, rays = view.has_right, []
-    for which, pixels in enumerate((view.left_px, view.right_px)):
-        normalised, _ = unproject_pixels(
+    left, right = (
+        unproject_pixels(
             int(calibration.models[pair, which]), calibration.intrinsics[pair, which],
-            calibration.distortion[pair, which], np.ascontiguousarray(pixels[matched]),
-        )  # fmt: skip
-        rays.append(np.column_stack([normalised, np.ones(len(normalised))]))
-    right_T_left = calibration.right_T_left[pair]
-    lines = rays[0] @ (skew(right_T_left[:3, 3]) @ right_T_left[:3, :3]).T
-    distances = np.sum(lines * rays[1], axis=1) / np.hypot(lines[:, 0], lines[:, 1])
+            calibration.distortion[pair, which], np.ascontiguousarray(pixels[view.has_right]),
+        )[0]
+        for which, pixels in enumerate((view.left_px, view.right_px))
+    )  # fmt: skip
+    distances = epipolar_distances(left, right, calibration.right_T_left[pair])
     scale = central_scale(int(calibration.models[pair, 1]), calibration.distortion[pair, 1])
     return float(np.median(distances) * calibration.intrinsics[pair, 1, 0] * scale)
 
