@@ -33,13 +33,7 @@ from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import interval_params, is_as_stated, preintegrate, preintegration_params
 from graphvio.backend.readout_factor import corrected, jacobians_of, readout_factor
 from graphvio.backend.reference_views import ReferenceViews
-from graphvio.backend.states import (
-    InitialUncertainty,
-    RigState,
-    StateCovariance,
-    level_gravity,
-    tilt_covariance,
-)
+from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity, tilt_covariance
 from graphvio.backend.window import SOLVER_ERRORS, GraphWindow
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, skew

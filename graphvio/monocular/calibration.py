@@ -192,9 +192,8 @@ class WindowCalibration:
         self._files.clear()
         return change
 
-    @property
     def covariance_so_far(self) -> Float:
-        """Covariance (F, F) of all parameters, by the evidence so far and a file as wrong as stated or more."""
+        """Return the covariance (F, F) by the evidence so far, and by a file as wrong as stated or more."""
         known = self._evidence.given(self._prior, np.maximum(self.factors, _MIN_FACTOR))
         return np.asarray(np.linalg.inv(known.information))
 

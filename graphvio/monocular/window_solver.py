@@ -151,7 +151,7 @@ class WindowSolver:
             self._knocks.forget()
         elif is_keyframe and calibration.size:
             difference = adjusted.states.calibration[: adjusted.states.n_camera_parameters]
-            knocked = self._knocks.update(window.views[-1], difference, lambda: calibration.covariance_so_far)
+            knocked = self._knocks.update(window.views[-1], difference, calibration.covariance_so_far)
             if knocked:
                 adjusted, ids = self._after_knock(window, knocked)
         self.samples.time_offset_s = time_offset_s(adjusted.states.calibration)
